@@ -232,6 +232,7 @@ class VqfAttitude:
         self._transient_rad = 0.0
         self._turned_rad: Sequence[float] = (0.0, 0.0, 0.0)
         self._yaw_rad = 0.0
+        self._unread_s = 0.0
 
     def update(self, sample: ImuSample) -> AttitudeEstimate | None:
         """Take a sample; return None during the start."""
@@ -318,12 +319,13 @@ class VqfAttitude:
             TILT_SIGMA_RAD**2 + SWELL_SIGMA_RAD**2 + (bias_sigma_radps * self._tilt_tau_s) ** 2 + self._transient_rad**2
         )
         self._heading.predict(dt_s, bias_sigma_radps)
-        yaw_rad = math.atan2(R_level_body[1][0], R_level_body[0][0])
+        self._unread_s = min(self._unread_s + dt_s, GAP_S)
         if sample.mag_t is not None:
+            yaw_rad = math.atan2(R_level_body[1][0], R_level_body[0][0])
             x, y, z = seen_before(self._calibration.apply(sample.mag_t).tolist(), turned_rad)
             field_t = [rx * x + ry * y + rz * z for rx, ry, rz in R_level_body]
-            self._heading.update(dt_s, field_t, wrap(yaw_rad - self._yaw_rad))
-        self._yaw_rad = yaw_rad
+            self._heading.update(self._unread_s, field_t, wrap(yaw_rad - self._yaw_rad))
+            self._yaw_rad, self._unread_s = yaw_rad, 0.0
         return AttitudeEstimate(
             sample.stamp_ns,
             ned_of_enu(q_level_body, self._declination_rad - self._heading.delta_rad),

@@ -32,10 +32,8 @@ from msgspec import UNSET
 
 log = logging.getLogger(__name__)
 
+# Without an inertial unit.
 TURN_NS: Final = 10 * MS_NS
-# So many readings are decoded, estimated, recorded and sent together, 50 ms: no later than the picture of the same
-# instant has been read out and searched.
-BLOCK: Final = 5
 ATTITUDE_EVERY: Final = 2
 REOPEN_NS: Final = 2 * S_NS
 
@@ -43,20 +41,22 @@ D = TypeVar("D", ImuDevice, DepthDevice)
 
 
 class Metronome:
-    """Keeps a loop at a fixed period, also if its clock is set meanwhile."""
+    """Keeps a loop at its period, also if its clock is set meanwhile."""
 
-    def __init__(self, period_ns: int, clock: Clock) -> None:
-        self._period_ns = period_ns
+    def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._next_ns = clock.now_ns()
 
-    def wait(self, stop: threading.Event) -> bool:
-        """Wait for the next turn, at most a period; return True if stop is set."""
+    def wait(self, stop: threading.Event, period_ns: int, wake_ns: Callable[[int], int] = lambda at_ns: at_ns) -> bool:
+        """Wait for the next turn, hardly more than a period; return True if stop is set.
+
+        wake_ns: chooses an instant near it, at most an eighth of the period away.
+        """
         now_ns = self._clock.now_ns()
-        self._next_ns += self._period_ns
-        if not now_ns <= self._next_ns <= now_ns + self._period_ns:
-            self._next_ns = now_ns + self._period_ns
-        return self._clock.wait_until_ns(self._next_ns, stop)
+        self._next_ns += period_ns
+        if not now_ns <= self._next_ns <= now_ns + period_ns + period_ns // 8:
+            self._next_ns = now_ns + period_ns
+        return self._clock.wait_until_ns(wake_ns(self._next_ns), stop)
 
 
 class Opener(Generic[D]):
@@ -85,7 +85,7 @@ class Opener(Generic[D]):
 
 
 class ImuSource:
-    """The inertial unit at 100 Hz, and 60 attitudes a second estimated from it, BLOCK samples at a time.
+    """The inertial unit at 100 Hz or so, and the attitudes estimated from it, some samples at a time.
 
     beside: a pressure sensor on the same bus. It is read in the same turns, because to wake a thread of its own would
     cost more than to read it, and its samples come with the block that they end.
@@ -109,7 +109,7 @@ class ImuSource:
         self._attitude = attitude
         self._beside = beside
         self._readings: list[ImuReading] = []
-        self._turn = Metronome(TURN_NS, clock)
+        self._turn = Metronome(clock)
         self._health = DeviceHealth(self.name)
         self._compass = DeviceHealth("compass")
         if beside is not None:
@@ -127,10 +127,11 @@ class ImuSource:
 
     def next_messages(self, stop: threading.Event) -> list[Message] | None:
         """Wait for the next block of samples; a failure, or a sample of the sensor beside it, ends it early."""
-        while not self._turn.wait(stop):
+        while not self._wait(stop):
             failed = self._fetch()
             beside = [] if self._beside is None else self._beside.step()
-            if not failed and not beside and len(self._readings) < BLOCK:
+            device = self._opener.device
+            if not failed and not beside and device is not None and len(self._readings) < device.readings:
                 continue
             samples, problem = self._decode()
             self._health.update(failed or problem)
@@ -138,6 +139,12 @@ class ImuSource:
                 return self._messages(samples) + beside
         samples, _ = self._decode()
         return self._messages(samples) or None
+
+    def _wait(self, stop: threading.Event) -> bool:
+        device = self._opener.device
+        if device is None:
+            return self._turn.wait(stop, TURN_NS)
+        return self._turn.wait(stop, device.turn_ns, device.wake_ns)
 
     def _fetch(self) -> str:
         """Take a reading; return why there is none, "" if there is."""
@@ -150,12 +157,14 @@ class ImuSource:
     def _decode(self) -> tuple[list[ImuSample], str]:
         """Return the samples of the readings, and what is wrong with the device ("" if nothing)."""
         readings, self._readings = self._readings, []
-        device, samples, settling = self._opener.device, [], ""
+        device, settling = self._opener.device, ""
+        samples: list[ImuSample] = []
         if device is None:
             return [], ""
         for reading in readings:
             try:
-                samples.append(device.decode(reading))
+                # Those before one that fails stay.
+                samples.extend(device.decode(reading))
                 settling = ""
             except SettlingError as error:
                 settling = str(error)
@@ -218,7 +227,7 @@ class DepthSource:
         self._zero_path = zero_path
         self._zero = SurfaceZero(load_zero(zero_path, clock.now_ns()))
         self._clock = clock
-        self._turn = Metronome(TURN_NS, clock)
+        self._turn = Metronome(clock)
         self._health = DeviceHealth(self.name)
 
     @property
@@ -233,7 +242,7 @@ class DepthSource:
 
     def next_messages(self, stop: threading.Event) -> list[Message] | None:
         """Wait for the next sample."""
-        while not self._turn.wait(stop):
+        while not self._turn.wait(stop, TURN_NS):
             messages = self.step()
             if messages:
                 return messages

@@ -6,7 +6,7 @@ import math
 from typing import Final
 
 from buddyline.node.drivers.samples import Vector
-from buddyline.node.drivers.st_chip import StChip, decode_vector
+from buddyline.node.drivers.st_chip import StChip, decode_vectors
 
 AUTO_INCREMENT: Final = 0x80
 OUT_TEMPERATURE: Final = 0x26  # the status, then the rates at 0x28, follow: one burst of eight bytes
@@ -15,8 +15,8 @@ GYRO_RADPS_PER_COUNT: Final = math.radians(17.50e-3)  # +-500 deg/s
 
 
 def decode_gyro(data: bytes) -> Vector:
-    """Return the angular rate in rad/s, (3,) in the chip's frame, of six bytes at +-500 deg/s."""
-    return decode_vector(data) * GYRO_RADPS_PER_COUNT
+    """Return the angular rate in rad/s, (n, 3) in the chip's frame, of six bytes each at +-500 deg/s."""
+    return decode_vectors(data) * GYRO_RADPS_PER_COUNT
 
 
 def decode_temperature(data: bytes) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from buddyline.node.drivers.samples import Vector
-from buddyline.node.drivers.st_chip import StChip, decode_vector
+from buddyline.node.drivers.st_chip import StChip, decode_vectors
 
 AUTO_INCREMENT: Final = 0x80
 OUT_MAG: Final = 0x28
@@ -14,8 +14,8 @@ MAG_T_PER_COUNT: Final = 1e-4 / 6842  # +-4 gauss
 
 
 def decode_mag(data: bytes) -> Vector:
-    """Return the magnetic field in T, (3,) in the chip's frame, of six bytes at +-4 gauss."""
-    return decode_vector(data) * MAG_T_PER_COUNT
+    """Return the magnetic field in T, (n, 3) in the chip's frame, of six bytes each at +-4 gauss."""
+    return decode_vectors(data) * MAG_T_PER_COUNT
 
 
 class Lis3mdl(StChip):
@@ -37,5 +37,5 @@ class Lis3mdl(StChip):
         return self.bus.read(self.address, OUT_MAG | AUTO_INCREMENT, 6)
 
     def decode_mag(self, data: bytes) -> Vector:
-        """Return the magnetic field in T, (3,)."""
+        """Return the magnetic field in T, (n, 3)."""
         return decode_mag(data)

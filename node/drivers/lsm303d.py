@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from buddyline.node.drivers.samples import STANDARD_GRAVITY_MPS2, Vector
-from buddyline.node.drivers.st_chip import StChip, decode_vector
+from buddyline.node.drivers.st_chip import StChip, decode_vectors
 
 AUTO_INCREMENT: Final = 0x80
 OUT_MAG: Final = 0x08
@@ -16,13 +16,13 @@ MAG_T_PER_COUNT: Final = 0.160e-3 * 1e-4  # +-4 gauss
 
 
 def decode_accel(data: bytes) -> Vector:
-    """Return the specific force in m/s2, (3,) in the chip's frame, of six bytes at +-4 g."""
-    return decode_vector(data) * ACCEL_MPS2_PER_COUNT
+    """Return the specific force in m/s2, (n, 3) in the chip's frame, of six bytes each at +-4 g."""
+    return decode_vectors(data) * ACCEL_MPS2_PER_COUNT
 
 
 def decode_mag(data: bytes) -> Vector:
-    """Return the magnetic field in T, (3,) in the chip's frame, of six bytes at +-4 gauss."""
-    return decode_vector(data) * MAG_T_PER_COUNT
+    """Return the magnetic field in T, (n, 3) in the chip's frame, of six bytes each at +-4 gauss."""
+    return decode_vectors(data) * MAG_T_PER_COUNT
 
 
 class Lsm303d(StChip):
@@ -48,5 +48,5 @@ class Lsm303d(StChip):
         return self.bus.read(self.address, OUT_MAG | AUTO_INCREMENT, 6)
 
     def decode_mag(self, data: bytes) -> Vector:
-        """Return the magnetic field in T, (3,)."""
+        """Return the magnetic field in T, (n, 3)."""
         return decode_mag(data)

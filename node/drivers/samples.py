@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -27,9 +28,12 @@ class SettlingError(DeviceError):
 
 
 class ImuReading(NamedTuple):
-    """What an inertial unit's chips said, as bytes. mag: None without a magnetometer."""
+    """What an inertial unit's chips said, as bytes.
 
-    stamp_ns: int
+    stamps_ns: of each sample in `motion`. mag: of the last sample; None without a magnetometer.
+    """
+
+    stamps_ns: Sequence[int]
     motion: bytes
     mag: bytes | None
 
@@ -38,9 +42,9 @@ class ImuReading(NamedTuple):
 class ImuSample:
     """One reading in the body frame, (3,) each.
 
-    accel_mps2: specific force, so (0, 0, -9.8) of a level node at rest. mag_t: None without a magnetometer.
-    saturated: acceleration or rate was at full scale, so that the true one may be larger. temperature_degc: of the
-    gyroscope, once a second; else None.
+    accel_mps2: specific force, so (0, 0, -9.8) of a level node at rest. mag_t: None without a magnetometer, and where
+    it was not read. saturated: acceleration or rate was at full scale, so that the true one may be larger.
+    temperature_degc: of the gyroscope, once a second; else None.
     """
 
     stamp_ns: int
@@ -71,22 +75,33 @@ class BatterySample:
 class ImuDevice(Protocol):
     """Accelerometer, gyroscope and, on most boards, magnetometer.
 
-    It is read a hundred times a second, and its readings are decoded some at a time: the processor's caches are cold
-    after each wait, and a reading then costs several times what the next one does.
-    problem: what is wrong although samples come; "" if nothing.
+    After each wait the processor's caches are cold, and a sample then costs several times what the next one does. So a
+    FIFO is read every turn_ns, or single samples are and their readings decoded some at a time.
+    turn_ns: the time between two readings. readings: how many are decoded together. problem: what is wrong although
+    samples come; "" if nothing.
     """
 
     name: str
 
     @property
+    def turn_ns(self) -> int: ...  # noqa: D102
+
+    @property
+    def readings(self) -> int: ...  # noqa: D102
+
+    @property
     def problem(self) -> str: ...  # noqa: D102
+
+    def wake_ns(self, instant_ns: int) -> int:
+        """Return the best instant for a reading near this one."""
+        ...
 
     def fetch(self) -> ImuReading:
         """Return the newest reading; raise DeviceError if there is none. The next call tries again."""
         ...
 
-    def decode(self, reading: ImuReading) -> ImuSample:
-        """Return the sample of a reading, in their order; raise DeviceError if the chips did not measure it.
+    def decode(self, reading: ImuReading) -> Iterator[ImuSample]:
+        """Give the samples of a reading, in their order; raise DeviceError at one that the chips did not measure.
 
         SettlingError: they have just been started. Any other: they are started again, and what was read meanwhile does
         not count.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from typing import ClassVar, Self
 
 import numpy as np
@@ -12,9 +11,9 @@ from buddyline.node.drivers.samples import DeviceError, Vector
 WHO_AM_I = 0x0F
 
 
-def decode_vector(data: bytes) -> Vector:
-    """Return three little-endian 16-bit counts, (3,)."""
-    return np.array(struct.unpack("<3h", data), dtype=np.float64)
+def decode_vectors(data: bytes) -> Vector:
+    """Return little-endian 16-bit counts as rows of three, (n, 3)."""
+    return np.frombuffer(data, "<i2").reshape(-1, 3).astype(np.float64)
 
 
 class StChip:

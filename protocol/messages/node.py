@@ -142,7 +142,7 @@ class NodeInfo(Message, frozen=True, kw_only=True):
 
 
 class Imu(Message, frozen=True, kw_only=True):
-    """Raw inertial sample in the body frame; mag_t is absent without a magnetometer.
+    """Raw inertial sample in the body frame; mag_t is absent without a magnetometer, and where it was not read.
 
     temperature_degc: of the gyroscope, once a second.
     """

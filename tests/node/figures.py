@@ -22,9 +22,9 @@ IMU_PERIOD_NS = 10_000_000
 SEEDS = range(1, 11)
 START_NS = 1_764_000_000 * S_NS
 BOARDS = {
-    "minimu9_v3": lambda sky: {0x1D: wire.lsm303d(sky), 0x6B: wire.l3gd20h(sky)},
-    "minimu9_v5": lambda sky: {0x6B: wire.lsm6ds(sky, 0x69), 0x1E: wire.lis3mdl(sky)},
-    "minimu9_v6": lambda sky: {0x6B: wire.lsm6ds(sky, 0x6C), 0x1E: wire.lis3mdl(sky)},
+    "minimu9_v3": lambda sky, clock: {0x1D: wire.lsm303d(sky), 0x6B: wire.l3gd20h(sky)},
+    "minimu9_v5": lambda sky, clock: {0x6B: wire.lsm6ds(sky, 0x69, clock), 0x1E: wire.lis3mdl(sky)},
+    "minimu9_v6": lambda sky, clock: {0x6B: wire.lsm6ds(sky, 0x6C, clock), 0x1E: wire.lis3mdl(sky)},
 }
 
 
@@ -32,7 +32,7 @@ def bus_rates(board: str, bit_hz: int) -> str:
     """Run inertial unit and depth on one bus; return what they reach."""
     clock = ManualClock(START_NS)
     adapter = wire.Adapter(clock, bit_hz=bit_hz)
-    adapter.chips.update(BOARDS[board](wire.Sky()))
+    adapter.chips.update(BOARDS[board](wire.Sky(), clock))
     adapter.chips[0x76] = wire.Ms5837Wire(clock, wire.WORDS_30BA, wire.D1_30BA, wire.D2_30BA)
     with pytest.MonkeyPatch.context() as patch:
         adapter.attach(patch)

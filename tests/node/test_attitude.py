@@ -63,9 +63,14 @@ def calm_run(seed: int = 1) -> Run:
 
 
 @lru_cache
-def disturbed_run(seed: int = 1) -> Run:
+def disturbed_run(seed: int = 1, every: int = 1) -> Run:
     dive = swell.simulate(58.0, seed=seed, disturbances=((34.0, 46.0, 15e-6),))
-    return estimate(dive, VqfAttitude(SOUND, HERE))
+    return estimate(with_compass(dive, every), VqfAttitude(SOUND, HERE))
+
+
+def with_compass(dive: swell.SwellDive, every: int) -> swell.SwellDive:
+    """Leave the compass out of all samples but some."""
+    return replace(dive, samples=[s if i % every == 0 else replace(s, mag_t=None) for i, s in enumerate(dive.samples)])
 
 
 def test_ned_of_enu_maps_axes():
@@ -99,9 +104,22 @@ def test_tilt_and_heading_in_swell(seed):
     assert not any(run.problems)
 
 
-def test_a_disturbance_is_flagged_and_hardly_turns_the_heading():
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_compass_with_every_fourth_sample_does_as_well(seed):
+    """As where a FIFO gives four samples for one reading of the compass."""
+    dive = swell.simulate(40.0, seed=seed)
+    dense, sparse = (estimate(with_compass(dive, every), VqfAttitude(SOUND, HERE)) for every in (1, 4))
+    later = dense.times_s > 10
+    assert sparse.heading_rms_deg(later) < 0.7
+    # But where a field is confirmed a reading later.
+    assert np.isclose(sparse.sigmas_rad[later, 2], dense.sigmas_rad[later, 2], rtol=0.05).mean() > 0.99
+    assert not any(sparse.problems)
+
+
+@pytest.mark.parametrize("every", [1, 4])
+def test_a_disturbance_is_flagged_and_hardly_turns_the_heading(every):
     """15 uT fixed to the rig, a third of a horizontal field of 22 uT, turns a bare compass by up to 40 deg."""
-    run = disturbed_run()
+    run = disturbed_run(1, every)
     flagged = np.array([bool(problem) for problem in run.problems])
     assert flagged[run.disturbed].mean() > 0.85
     assert not flagged[run.times_s < 34].any()

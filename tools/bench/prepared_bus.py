@@ -6,14 +6,18 @@ The drivers and smbus2's messages above it are a node's own. The kernel's transf
 from __future__ import annotations
 
 import ctypes
+import time
 from typing import Any, Final
 
 import numpy as np
 from buddyline.node.drivers.i2c import I2cBus
 
 MOTION, COMPASS, PRESSURE = 0x6B, 0x1E, 0x76
-# The first register of a burst of outputs, and the counts of a unit at rest.
-OUTPUTS: Final = {MOTION: (0x20, (0, 0, 0, 0, 0, 0, -8192)), COMPASS: (0xA8, (1500, 0, 3000))}
+# The counts of a unit at rest, as words of the FIFO with their tags, and of the compass.
+ACCEL_COUNTS: Final = (0, 0, -8192)
+COMPASS_COUNTS: Final = (1500, 0, 3000)
+FIFO_LEVEL, FIFO_DATA, COMPASS_DATA = 0x3A, 0x78, 0xA8
+PERIOD_NS: Final = 1_000_000_000 // 104
 IDENTITIES: Final = {MOTION: 0x6C, COMPASS: 0x3D}
 WHO_AM_I: Final = 0x0F
 BURSTS: Final = 1000
@@ -37,11 +41,12 @@ class _Chips:
     def __init__(self) -> None:
         rng = np.random.default_rng(1)
         self._registers: dict[tuple[int, int], int] = {}
-        self._bursts: dict[int, list[bytes]] = {}
-        for address, (_, counts) in OUTPUTS.items():
-            noise = rng.integers(-NOISE_COUNTS, NOISE_COUNTS + 1, (BURSTS, len(counts)))
-            self._bursts[address] = [row.tobytes() for row in (noise + counts).astype("<i2")]
+        noise = rng.integers(-NOISE_COUNTS, NOISE_COUNTS + 1, (BURSTS, 9))
+        rows = (noise + np.array((0, 0, 0, *ACCEL_COUNTS, *COMPASS_COUNTS))).astype("<i2")
+        self._samples = [b"\x08" + row[:3].tobytes() + b"\x10" + row[3:6].tobytes() for row in rows]
+        self._fields: list[bytes] = [row[6:].tobytes() for row in rows]
         self._number = 0
+        self._taken_ns = time.monotonic_ns()
         self._command = 0
 
     def i2c_rdwr(self, request: Any, reply: Any = None) -> None:
@@ -63,9 +68,17 @@ class _Chips:
             if register:
                 return PROM[(register - 0xA0) // 2].to_bytes(2, "big")
             return (PRESSURE_COUNTS if self._command < 0x50 else TEMPERATURE_COUNTS).to_bytes(3, "big")
-        if address in OUTPUTS and register == OUTPUTS[address][0] and count > 1:
+        if address == MOTION and register == FIFO_LEVEL:
+            words = min(2 * ((time.monotonic_ns() - self._taken_ns) // PERIOD_NS), 255)
+            return bytes([words, 0])
+        if address == MOTION and register == FIFO_DATA:
+            samples = count // 14
+            self._taken_ns += samples * PERIOD_NS
+            self._number += samples
+            return b"".join(self._samples[(self._number + i) % BURSTS] for i in range(samples))
+        if address == COMPASS and register == COMPASS_DATA:
             self._number += 1
-            return self._bursts[address][self._number % BURSTS][:count]
+            return self._fields[self._number % BURSTS]
         if register == WHO_AM_I and address in IDENTITIES:
             return bytes([IDENTITIES[address]])
         return bytes([self._registers.get((address, register), 0)] * count)

@@ -146,14 +146,106 @@ def l3gd20h(sky: Sky) -> StWire:
     return chip
 
 
-def lsm6ds(sky: Sky, identity: int) -> StWire:
-    chip = StWire(identity, {0x12: 0x04}, marks=False)
-    chip.outputs[0x22] = (sky.counts("gyro"), lambda: chip.registers.get(0x11, 0) >> 4 > 0)
-    chip.outputs[0x28] = (
-        sky.counts("accel", lambda: (1, 8, 2, 4)[chip.registers.get(0x10, 0) >> 2 & 3]),
-        lambda: chip.registers.get(0x10, 0) >> 4 > 0,
-    )
-    return chip
+class Lsm6dsWire(StWire):
+    """An LSM6DS33 or LSM6DSO with its FIFO; only the rate of 104 Hz is known, and only when both sensors run.
+
+    rate_error: how much faster its clock is. taken_ns: when each sample that is in the FIFO, or was, was taken.
+    """
+
+    START_NS = 70_000_000
+    STATUS = 0x3A
+
+    def __init__(self, sky: Sky, identity: int, clock: ManualClock, rate_error: float = 0.0) -> None:
+        self.clock = clock
+        self.rate_error = rate_error
+        self.taken_ns: list[int] = []
+        self.stopped = False
+        self._gyro = sky.counts("gyro")
+        self._accel = sky.counts("accel", lambda: (1, 8, 2, 4)[self.registers.get(0x10, 0) >> 2 & 3])
+        self._tagged = identity == 0x6C
+        self._data, self._capacity = (0x78, 512 * 7) if self._tagged else (0x3E, 4096 * 2)
+        self._fifo = bytearray()
+        self._taken_bytes = 0
+        self._overrun = False
+        self._next_ns: float | None = None
+        super().__init__(identity, {0x12: 0x04}, marks=False)
+
+    def power_cycle(self) -> None:
+        super().power_cycle()
+        self._empty()
+        self._next_ns = None
+
+    def write(self, data: bytes) -> None:
+        self._fill()
+        super().write(data)
+        if self.registers.get(0x0A, 0) & 0x07 == 0:
+            self._empty()
+
+    def read(self, n: int) -> bytes:
+        self._fill()
+        if self._pointer == self._data:
+            data = bytes(self._fifo[:n]).ljust(n, b"\x00")
+            del self._fifo[:n]
+            self._taken_bytes += n
+            return data
+        self.registers.update(zip(range(self.STATUS, self.STATUS + 4), self._status(), strict=True))
+        if self._pointer <= self.STATUS + 1 < self._pointer + n:
+            self._overrun = False
+        return super().read(n)
+
+    def _empty(self) -> None:
+        self._fifo.clear()
+        self._taken_bytes = 0
+        self._overrun = False
+
+    def _kinds(self) -> tuple[bool, bool]:
+        """Whether gyroscope and accelerometer are put into the FIFO."""
+        third, fifth = self.registers.get(0x08, 0), self.registers.get(0x09, 0)
+        return (fifth >> 4 == 4, fifth & 0x0F == 4) if self._tagged else (third >> 3 & 7 == 1, third & 7 == 1)
+
+    def _fill(self) -> None:
+        mode = self.registers.get(0x0A, 0)
+        rates = self.registers.get(0x11, 0) >> 4, self.registers.get(0x10, 0) >> 4
+        if not any(rates):
+            self._next_ns = None
+            return
+        runs = mode & 0x07 == 6 and (self._tagged or mode >> 3 == 4) and not self.stopped
+        now_ns = self.clock.now_ns()
+        if self._next_ns is None:
+            self._next_ns = now_ns + self.START_NS
+        while self._next_ns <= now_ns:
+            if runs:
+                self._put(round(self._next_ns), rates)
+            self._next_ns += 1e9 / 104 / (1 + self.rate_error)
+
+    def _put(self, at_ns: int, rates: tuple[int, int]) -> None:
+        self.taken_ns.append(at_ns)
+        for tag, kept, rate, counts in zip((1, 2), self._kinds(), rates, (self._gyro, self._accel), strict=True):
+            if self._tagged and kept and rate:
+                self._fifo += bytes([tag << 3 | (len(self.taken_ns) & 3) << 1])
+            if kept and (rate or not self._tagged):
+                self._fifo += struct.pack("<3h", *(counts() if rate else (0, 0, 0)))
+        while len(self._fifo) > self._capacity:
+            self._overrun = True
+            word = 7 if self._tagged else 2
+            del self._fifo[:word]
+            self._taken_bytes += word
+
+    def _status(self) -> tuple[int, int, int, int]:
+        word = 7 if self._tagged else 2
+        level = len(self._fifo) // word
+        full = level * word == self._capacity
+        if self._tagged:
+            mark = self.registers.get(0x07, 0) | (self.registers.get(0x08, 0) & 1) << 8
+            flags = (0 < mark <= level) << 7 | self._overrun << 6 | full << 5 | self._overrun << 3
+            return level & 0xFF, flags | level >> 8 & 0x03, 0, 0
+        mark = self.registers.get(0x06, 0) | (self.registers.get(0x07, 0) & 0x0F) << 8
+        flags = (0 < mark <= level) << 7 | self._overrun << 6 | full << 5 | (not level) << 4
+        return level & 0xFF, flags | level >> 8 & 0x0F, self._taken_bytes // 2 % 6, 0
+
+
+def lsm6ds(sky: Sky, identity: int, clock: ManualClock, rate_error: float = 0.0) -> Lsm6dsWire:
+    return Lsm6dsWire(sky, identity, clock, rate_error)
 
 
 def lis3mdl(sky: Sky) -> StWire:
