@@ -254,9 +254,9 @@ class NetBelief:
     def _apply(self, H: Floats, y: Floats, noise: Floats, *, teaches: bool = False) -> None:
         assert self.state is not None
         before = self.covariance
-        error, self.covariance, _, S_inverse = anchors.kalman(before, H, y, noise)
+        error, self.covariance, _, S_inverse, gain = anchors.kalman(before, H, y, noise)
         if self.trail is not None:
-            self.trail.events.append(Learned(H, before @ H.T @ S_inverse, S_inverse, y))
+            self.trail.events.append(Learned(H, gain, S_inverse, y))
         if teaches:
             self.shaking = self.shaking.taught(y, S_inverse, H, before)
         self.state = self.state.plus(error)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_log
@@ -56,12 +56,22 @@ def depth_residual(state: State, shown_m: float, age_s: float, ports_m: Floats) 
     return np.array((shown_m - h,)), H
 
 
-def kalman(P: Floats, H: Floats, y: Floats, noise: Floats) -> tuple[Floats, Floats, float, Floats]:
-    """Give the error (SIZE,) to add, the covariance after, chi^2 of the residual and its covariance's inverse."""
+class Update(NamedTuple):
+    """The error (SIZE,) to add, the covariance after, chi^2 of the residual, its covariance's inverse, and the gain."""
+
+    error: Floats
+    covariance: Floats
+    chi2: float
+    S_inverse: Floats
+    gain: Floats
+
+
+def kalman(P: Floats, H: Floats, y: Floats, noise: Floats) -> Update:
+    """Give what residuals y (m,) of a covariance H P H^T + noise tell."""
     across = P @ H.T
     S = H @ across + noise
     inverse = np.asarray(np.linalg.inv(S), np.float64)
     gain = across @ inverse
     after = P - gain @ across.T
     after = 0.5 * (after + after.T)
-    return gain @ y, after, float(y @ inverse @ y), inverse
+    return Update(gain @ y, after, float(y @ inverse @ y), inverse, gain)

@@ -143,11 +143,20 @@ def _empty_filter(records: Records, clock_ns: int, clock_sigma_s: float) -> Trac
     return track
 
 
-def pass_over(track: TrackFilter, records: Records, fixes: Sequence[FixSeen]) -> None:
-    """Bring a filter through a dive, fed piece by piece, so that it holds a minute of samples at a time."""
+def pass_over(
+    track: TrackFilter,
+    records: Records,
+    fixes: Sequence[FixSeen],
+    start_ns: int = _BEGINNING_NS,
+    stop_ns: int = _END_NS,
+) -> None:
+    """Bring a filter through a dive, fed piece by piece, so that it holds a minute of samples at a time.
+
+    start_ns, stop_ns: of the part of the dive to take in, in whole pieces; a later call goes on from there.
+    """
     frames_ns = np.array([frame.stamp_ns for record in records for frame in record.frames], dtype=np.int64)
-    start_ns = _BEGINNING_NS
-    for end_ns in [*((np.unique(frames_ns // PIECE_NS) + 1) * PIECE_NS).tolist(), _END_NS]:
+    ends_ns = (np.unique(frames_ns // PIECE_NS) + 1) * PIECE_NS
+    for end_ns in [*ends_ns[(ends_ns > start_ns) & (ends_ns < stop_ns)].tolist(), stop_ns]:
         for node, record in enumerate(records):
             shift_ns = track.clock_ns if node else 0
             feed(track, node, record.between(start_ns + shift_ns, end_ns + shift_ns))
@@ -161,14 +170,16 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
     """Give the whole dive's track at outputs_ns."""
     records, fixes = (parted(in_order(records[0])), parted(in_order(records[1]))), sorted(fixes, key=_stamp_of)
     told_ns = clock_ns
-    if fixes and fixes[-1].stamp_ns - fixes[0].stamp_ns > 2 * HEAD_NS:
-        # The dive's beginning gives the clocks' offset, so that the whole dive needs no other round.
-        head_ns = fixes[0].stamp_ns - S_NS, fixes[0].stamp_ns + HEAD_NS
-        head = records[0].between(*head_ns), records[1].between(*head_ns)
-        clock_ns = _first_pass(head, _between(fixes, *head_ns), clock_ns, CLOCK_TRIES_S)[2]
-        first, parts, clock_ns = _first_pass(records, fixes, clock_ns)
-    else:
-        first, parts, clock_ns = _first_pass(records, fixes, clock_ns, CLOCK_TRIES_S)
+    long = bool(fixes) and fixes[-1].stamp_ns - fixes[0].stamp_ns > 2 * HEAD_NS
+    head_ns = (fixes[0].stamp_ns + HEAD_NS) // PIECE_NS * PIECE_NS if long else _END_NS
+    first, parts, clock_ns = _first_pass(records, fixes, clock_ns, head_ns)
+    if long:
+        # The dive's beginning has given the clocks' offset: what is left of the dive mostly needs no other round.
+        pass_over(first, records, fixes, head_ns)
+        parts = parts_of(first)
+        left_ns = _clock_left_ns(parts)
+        if left_ns:
+            first, parts, clock_ns = _rounds(records, fixes, clock_ns + left_ns)
     if not parts:
         return Smoothed([], clock_ns * 1e-9, math.inf, first.problems)
     parts = of_one_clock(parts)
@@ -238,17 +249,17 @@ def _path_before(records: Records, clock_ns: int, path: Path, since_s: float, sh
 
 
 def _first_pass(
-    records: Records, fixes: Sequence[FixSeen], clock_ns: int, tries_s: Sequence[float] = ()
+    records: Records, fixes: Sequence[FixSeen], clock_ns: int, stop_ns: int
 ) -> tuple[TrackFilter, list[Estimate], int]:
-    """Give a filter that has passed over a dive, its tracks, and how far B's clock was believed ahead.
+    """Give a filter that has passed over a dive up to stop_ns, its tracks, and how far B's clock was believed ahead.
 
-    tries_s: other offsets to try where this one gives more than one track; the one that explains most is taken.
+    Where that gives more than one track other offsets are tried, and the one that explains most is taken.
     """
-    best = _rounds(records, fixes, clock_ns)
-    for try_s in tries_s:
+    best = _rounds(records, fixes, clock_ns, stop_ns)
+    for try_s in CLOCK_TRIES_S:
         if len(best[1]) < 2:
             break
-        other = _rounds(records, fixes, clock_ns + round(try_s * 1e9))
+        other = _rounds(records, fixes, clock_ns + round(try_s * 1e9), stop_ns)
         best = max(best, other, key=lambda found: sum(part.evidence for part in found[1]))
     return best
 
@@ -282,17 +293,28 @@ def of_one_clock(parts: Sequence[Estimate]) -> list[Estimate]:
     return sound
 
 
-def _rounds(records: Records, fixes: Sequence[FixSeen], clock_ns: int) -> tuple[TrackFilter, list[Estimate], int]:
+def _rounds(
+    records: Records, fixes: Sequence[FixSeen], clock_ns: int, stop_ns: int = _END_NS
+) -> tuple[TrackFilter, list[Estimate], int]:
     """Pass over a dive until the offset is settled: a pass whose clocks are off finds too small an offset."""
     for left in reversed(range(CLOCK_ROUNDS)):
         first = _empty_filter(records, clock_ns, CLOCK_S)
-        pass_over(first, records, fixes)
+        pass_over(first, records, fixes, stop_ns=stop_ns)
         parts = parts_of(first)
-        without = any(any(part.without) for part in parts)
-        if not left or not parts or not clock_off_by(parts[-1], MOST_LEFT_S if without else NEAR_CLOCK_S):
+        left_ns = _clock_left_ns(parts)
+        if not left or not left_ns:
             break
-        clock_ns += round(parts[-1].state.clock_s * 1e9)
+        clock_ns += left_ns
     return first, parts, clock_ns
+
+
+def _clock_left_ns(parts: Sequence[Estimate]) -> int:
+    """Give by how much B's clock proves to be off what a pass assumed; 0 where that is near enough."""
+    if not parts:
+        return 0
+    without = any(any(part.without) for part in parts)
+    off = clock_off_by(parts[-1], MOST_LEFT_S if without else NEAR_CLOCK_S)
+    return round(parts[-1].state.clock_s * 1e9) if off else 0
 
 
 def clock_off_by(part: Estimate, limit_s: float) -> bool:

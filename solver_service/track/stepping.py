@@ -396,22 +396,21 @@ class TrackSteps(TrackIntake):
     @staticmethod
     def _apply(estimate: Estimate, H: Floats, y: Floats, noise: Floats, *, teaches: bool = False) -> float:
         before = estimate.covariance
-        error, estimate.covariance, chi2, S_inverse = anchors.kalman(before, H, y, noise)
+        error, estimate.covariance, chi2, S_inverse, gain = anchors.kalman(before, H, y, noise)
         estimate.state = estimate.state.plus(error)
         if estimate.by_shares.any():
             moved = H @ estimate.by_shares
             if teaches:
                 estimate.shares = estimate.shares.taught(y, S_inverse, moved)
-            estimate.by_shares = estimate.by_shares - before @ H.T @ (S_inverse @ moved)
+            estimate.by_shares = estimate.by_shares - gain @ moved
         if estimate.follows_walk:
-            gain = before @ H.T @ S_inverse
             learns = before[CLOCK, CLOCK] < KNOWN_CLOCK_S**2 and not (estimate.wide and any(estimate.without))
             estimate.walking = estimate.walking.taught(y, S_inverse, H, gain, learns=learns)
         # Depth and attitudes remove little of what shaking adds: to follow that would not be worth its time.
         if teaches:
             moving = H[:, :MOVING]
             estimate.shaking = estimate.shaking.taught(y, S_inverse, moving[:, :NAV], estimate.shaken[:, :NAV, :NAV])
-            rest = _STILL - before[:MOVING] @ H.T @ S_inverse @ moving
+            rest = _STILL - gain[:MOVING] @ moving
             estimate.shaken = rest @ estimate.shaken @ rest.T
         return chi2
 

@@ -49,9 +49,8 @@ def followed(walking: Walking, seen: Floats, noise: Floats, *, learns: bool) -> 
         walk = walk_of(walking)
         P = predicted(P, F, STILL, walk)
         walking = walking.stepped(F, walk, (True, True))
-        before = P
-        error, P, _, inverse = kalman(P, H, y - H @ x, noise)
-        taught = walking.taught(y - H @ x, inverse, H, before @ H.T @ inverse)
+        error, P, _, inverse, gain = kalman(P, H, y - H @ x, noise)
+        taught = walking.taught(y - H @ x, inverse, H, gain)
         walking = taught if learns else replace(taught, logs=walking.logs, information=walking.information)
         x = x + error
     return walking, x, P
@@ -107,9 +106,8 @@ def accelerated(walking: Walking, seen: Floats, noise: Floats, *, learns: bool) 
         guessed[0, V_, V_] = walking.densities[2] ** 2 * STEP_S * np.eye(3)
         P = predicted(P, F, guessed[0, :MOVING, :MOVING], np.zeros(SIZE - MOVING))
         walking = walking.stepped(F, np.zeros(SIZE - MOVING), (False, False), guessed)
-        before = P
-        error, P, _, inverse = kalman(P, H, y - H @ x, noise)
-        walking = walking.taught(y - H @ x, inverse, H, before @ H.T @ inverse, learns=learns)
+        error, P, _, inverse, gain = kalman(P, H, y - H @ x, noise)
+        walking = walking.taught(y - H @ x, inverse, H, gain, learns=learns)
         x = x + error
     return walking, P
 
