@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log, skew
-from buddyline.solver_service.network.motion import Move, as_first_of_pair, moved_member
+from buddyline.solver_service.network.motion import Move, moved_member
 from buddyline.solver_service.network.shaking import NetShaking
 from buddyline.solver_service.network.state import (
     BLOCK,
@@ -38,7 +38,7 @@ from buddyline.solver_service.track.stepping import (
     TOGETHER_S,
     WITHOUT_RAD,
     WITHOUT_RADPS,
-    increment,
+    increments,
 )
 from buddyline.solver_service.track.strapdown import Noise
 
@@ -203,19 +203,20 @@ class NetBelief:
         rates, without = np.zeros((n, 3)), [False] * n
         shaking = self.shaking.variances
         drawn = np.zeros((n, 2, MOVING, MOVING))
-        for i, member in enumerate(self.members):
-            if member.node in self.places:
-                continue
-            samples = self.intake.samples[member.node]
-            part = increment(samples, as_first_of_pair(state, i), 0, self.t_s, to_s)
+        moving = [i for i, member in enumerate(self.members) if member.node not in self.places]
+        if moving:
+            samples = [self.intake.samples[self.members[i].node] for i in moving]
+            parts = increments(samples, state if len(moving) == n else state.chosen(moving), self.t_s, to_s)
+        for part, i in enumerate(moving):
+            member = self.members[i]
             noise = self._noise_of(member.node, to_s)
-            after, F[i], Q[i], drawn[i] = moved_member(state, i, part, noise, shaking[i], to_s - self.t_s)
-            if part.without != member.without:
+            after, F[i], Q[i], drawn[i] = moved_member(state, i, parts, part, noise, shaking[i], to_s - self.t_s)
+            without[i] = bool(parts.without[part])
+            if without[i] != member.without:
                 # The unit has stopped, or come back: these errors now stand for something else, and are unknown.
                 Q[i, GYRO_BIAS, GYRO_BIAS] += WITHOUT_RADPS**2 * np.eye(3)
                 Q[i, MOUNT, MOUNT] += WITHOUT_RAD**2 * np.eye(3)
-            without[i] = part.without
-            rates[i] = part.rate_radps
+            rates[i] = parts.rate_radps[part]
             for name in names:
                 fields[name][i] = after[name]
         move = Move(F, Q)

@@ -26,47 +26,15 @@ from buddyline.solver_service.network.state import (
     own_of_plain,
     plain_of_own,
 )
-from buddyline.solver_service.track import state as pair_state
 from buddyline.solver_service.track.shaking import SHAKEN_S, kept_share
-from buddyline.solver_service.track.strapdown import Increment, Noise
+from buddyline.solver_service.track.strapdown import Increments, Noise
 
 GRAVITY_MPS2: Final = np.array((0.0, 0.0, 9.80665))
 _I: Final[Floats] = np.eye(3)
 # By how much the frame's zero may rise or sink in a step, where the frame moves with a node.
 DATUM_STEP_M: Final = 1.0
-# Where the errors of a node's increment stand in its Jacobian, which is laid out for the first node of a pair.
-_FROM: Final = np.r_[
-    pair_state.PHI[0],
-    pair_state.GYRO_BIAS[0],
-    pair_state.ACCEL_BIAS[0],
-    pair_state.MOUNT[0],
-    pair_state.LEVER[0],
-    pair_state.DELAY[0],
-]
-_TO: Final = np.r_[PHI, GYRO_BIAS, ACCEL_BIAS, MOUNT, LEVER, DELAY]
-
-
-def as_first_of_pair(state: NetState, member: int) -> pair_state.State:
-    """Return a member as the first node of a pair's state, for the track's integration."""
-    zero = np.zeros(3)
-
-    def both(values: Floats) -> Floats:
-        return np.stack((values[member], values[member]))
-
-    return pair_state.State(
-        r_m=zero,
-        v_mps=zero,
-        R=both(state.R),
-        shake_rad=both(state.shake_rad),
-        shove_mps=zero,
-        gyro_bias_radps=both(state.gyro_bias_radps),
-        accel_bias_mps2=both(state.accel_bias_mps2),
-        mount_rad=both(state.mount_rad),
-        lever_m=both(state.lever_m),
-        delay_s=both(state.delay_s),
-        clock_s=0.0,
-        depth_offset_m=0.0,
-    )
+# Where an increment's rows and columns stand in a member's transition.
+_INTO: Final = np.ix_(np.r_[PHI, V_, P_], np.r_[PHI, GYRO_BIAS, ACCEL_BIAS, MOUNT, LEVER, DELAY])
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,29 +100,29 @@ class Move:
 
 
 def moved_member(
-    state: NetState, member: int, part: Increment, noise: Noise, shaking: Floats, span_s: float
+    state: NetState, member: int, parts: Increments, part: int, noise: Noise, shaking: Floats, span_s: float
 ) -> tuple[dict[str, Floats], Floats, Floats, Floats]:
     """Give a member's fields after a step, its F (BLOCK, BLOCK) and Q (BLOCK, BLOCK), and what of that is shaking.
 
-    shaking (2,): variances of the unit's angle in its mount, and of the velocity that shaking adds.
+    part: which of the parts is the member's. shaking (2,): variances of the unit's angle in its mount, and of the
+    velocity that shaking adds.
     """
     kept = kept_share(span_s)
-    felt = 0.0 if part.without else 1.0
+    felt = 0.0 if parts.without[part] else 1.0
     gone, back_s = felt * (1.0 - kept), felt * (span_s - SHAKEN_S * (1.0 - kept))
     p, v, R0 = state.p_m[member], state.v_mps[member], state.R[member]
     shake, shove = felt * state.shake_rad[member], state.shove_mps[member]
-    R = rotation_exp(R0 @ shake) @ part.R @ rotation_exp(-kept * shake)
+    R = rotation_exp(R0 @ shake) @ parts.R[part] @ rotation_exp(-kept * shake)
     after = {
-        "p_m": p + span_s * v + back_s * shove + part.dp_m + 0.5 * span_s**2 * GRAVITY_MPS2,
-        "v_mps": v + gone * shove + part.dv_mps + span_s * GRAVITY_MPS2,
+        "p_m": p + span_s * v + back_s * shove + parts.dp_m[part] + 0.5 * span_s**2 * GRAVITY_MPS2,
+        "v_mps": v + gone * shove + parts.dv_mps[part] + span_s * GRAVITY_MPS2,
         "R": R,
         "shake_rad": kept * state.shake_rad[member],
         "shove_mps": kept * shove,
     }
     F = np.eye(BLOCK)
     F[:MOVING] = 0.0
-    for rows, block_rows in ((PHI, slice(0, 3)), (V_, slice(3, 6)), (P_, slice(6, 9))):
-        F[rows, _TO] = part.jacobian[block_rows, _FROM]
+    F[_INTO] = parts.jacobian[part]
     F[P_, P_] = F[V_, V_] = _I
     F[P_, V_] = span_s * _I
     F[P_, SHOVE] = back_s * _I
@@ -166,25 +134,25 @@ def moved_member(
     T[:MOVING, :MOVING] = own_of_plain(after["p_m"], after["v_mps"], after["shove_mps"])
     moving = T[:MOVING, :MOVING]
     drawn = felt * shaking[:, None, None] * (moving @ shaking_parts(R, span_s) @ moving.T)
-    Q = T @ _noise(part, noise, span_s) @ T.T
+    Q = T @ _noise(float(parts.gap_s[part]), noise, span_s, without=bool(parts.without[part])) @ T.T
     Q[:MOVING, :MOVING] += drawn.sum(axis=0)
     return after, T @ F, Q, drawn
 
 
-def _noise(part: Increment, noise: Noise, span_s: float) -> Floats:
+def _noise(gap_s: float, noise: Noise, span_s: float, *, without: bool) -> Floats:
     """Give what a step adds to a member's plain errors (BLOCK, BLOCK) but for shaking; as strapdown.process_noise."""
     Q = np.zeros((BLOCK, BLOCK))
-    force = noise.accel_mps**2 * span_s + noise.gap_accel_mps**2 * part.gap_s
+    force = noise.accel_mps**2 * span_s + noise.gap_accel_mps**2 * gap_s
     Q[V_, V_] = force * _I
     Q[P_, V_] = Q[V_, P_] = 0.5 * span_s * force * _I
     Q[P_, P_] = span_s * span_s / 3.0 * force * _I
-    if part.without:
+    if without:
         Q[PHI, PHI] = noise.gap_rate_radps**2 * span_s**3 / 3.0 * _I
         Q[GYRO_BIAS, GYRO_BIAS] = noise.gap_rate_radps**2 * span_s * _I
         walks = np.array((noise.gap_tilt_rad, noise.gap_tilt_rad, noise.gap_heading_rad))
         Q[MOUNT, MOUNT] = np.diag(walks**2 * span_s)
     else:
-        Q[PHI, PHI] = (noise.gyro_rad**2 * span_s + noise.gap_gyro_rad**2 * part.gap_s) * _I
+        Q[PHI, PHI] = (noise.gyro_rad**2 * span_s + noise.gap_gyro_rad**2 * gap_s) * _I
         Q[GYRO_BIAS, GYRO_BIAS] = noise.gyro_bias_radps**2 * span_s * _I
     Q[ACCEL_BIAS, ACCEL_BIAS] = noise.accel_bias_mps2**2 * span_s * _I
     return Q

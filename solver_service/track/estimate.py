@@ -24,12 +24,12 @@ class Estimate:
 
     The filter: rates_radps (2, 3): the turn rates at t_s. shaking: how much the units are shaken in their mounts, as
     learned from the lights' residuals; shaken (3, MOVING, MOVING): the parts of the covariance that come from it.
-    walking: how much the units' biases walk, or the nodes themselves, learned if learns_walk, once the track is
-    confirmed and the clocks' offset known; follows_walk: since then. wide: whether the place was poorly known at the
-    last picture. without: which nodes have no inertial unit now. turning_off: of each, the lasting part (3,) of what
-    its attitudes are off their prediction, in sigmas. by_shares (SIZE, 4): how the state would be moved by a share of 1
-    of the samples' fast parts; shares: what the lights tell of them (vibration.py). attitude_s, depth_s: when attitudes
-    and depths were last used.
+    walking: how much the units' biases walk, or the nodes themselves, learned once the track is confirmed and the
+    clocks' offset known; follows_walk: since then. learns: whether walks and shares are learned. wide: whether the
+    place was poorly known at the last picture. without: which nodes have no inertial unit now. turning_off: of each,
+    the lasting part (3,) of what its attitudes are off their prediction, in sigmas. by_shares (SIZE, 4): how the state
+    would be moved by a share of 1 of the samples' fast parts; shares: what the lights tell of them (vibration.py).
+    attitude_s, depth_s: when attitudes and depths were last used.
 
     The lights: detection (2, 2): by observer and light, how likely a light in the picture is found. last_seen (2,):
     the probability that each light is among the last picture's candidates, None where not both should be in it.
@@ -66,7 +66,7 @@ class Estimate:
     shaking: Shaking = field(default_factory=Shaking)
     shaken: Floats = field(default_factory=lambda: np.zeros((3, MOVING, MOVING)))
     walking: Walking = field(default_factory=Walking)
-    learns_walk: bool = True
+    learns: bool = True
     follows_walk: bool = False
     wide: bool = False
     surprise: float = 0.0

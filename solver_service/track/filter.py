@@ -117,7 +117,7 @@ class TrackFilter(TrackPool):
             return main.state, main.covariance, main.rates_radps
         parts = self.increments(main, t_s)
         state, P = self._predict(main, t_s, parts=parts)
-        return state, P, np.stack((parts[0].rate_radps, parts[1].rate_radps))
+        return state, P, parts.rate_radps
 
     def doubted(self) -> bool:
         """Whether a live track is not to be told; `problems` says why.
@@ -229,7 +229,7 @@ class TrackFilter(TrackPool):
     def begin(self, t_s: float, end_s: float, state: State, P: Floats, shaking: Shaking, walking: Walking) -> None:
         """Start from a state that is known beforehand, confirmed; a later one takes over at its time.
 
-        walking: as it was learned; it is not learned further.
+        walking: as it was learned; it is not learned further, nor are shares.
         """
         estimate = Estimate(
             t_s,
@@ -243,7 +243,7 @@ class TrackFilter(TrackPool):
             light_s=t_s,
             shaking=shaking,
             walking=walking,
-            learns_walk=False,
+            learns=False,
         )
         self._open(estimate)
         self._waiting.append(estimate)

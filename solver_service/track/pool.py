@@ -119,12 +119,11 @@ class TrackPool(TrackSteps):
             span_s = t_s - since_s
             # Where it came from follows from how far it has turned, whatever it was turned to.
             at = replace(estimate, t_s=since_s, state=state.moved(state.r_m, state.v_mps, np.stack((np.eye(3),) * 2)))
-            turns = [part.R for part in self.increments(at, t_s)]
-            R = np.stack([now @ turn.T for now, turn in zip(state.R, turns, strict=True)])
+            R = state.R @ np.swapaxes(self.increments(at, t_s).R, 1, 2)
             at.state = state.moved(state.r_m, state.v_mps, R)
-            a, b = self.increments(at, t_s)
-            v_mps = state.v_mps - (b.dv_mps - a.dv_mps)
-            state = state.moved(state.r_m - v_mps * span_s - (b.dp_m - a.dp_m), v_mps, R)
+            parts = self.increments(at, t_s)
+            v_mps = state.v_mps - (parts.dv_mps[1] - parts.dv_mps[0])
+            state = state.moved(state.r_m - v_mps * span_s - (parts.dp_m[1] - parts.dp_m[0]), v_mps, R)
             t_s = since_s
         return replace(state, shake_rad=np.zeros((2, 3)), shove_mps=np.zeros(3))
 

@@ -21,15 +21,16 @@ ACCEL_FLOOR: Final = 1e-3
 class Samples:
     """Inertial samples in camera axes, by stamp in s since an epoch.
 
-    `rejected` counts samples that were not finite, or came twice. `trusted`: whether they are to be used. `shares`
-    (2,): how much of the fast part of force and rate is the unit's alone, and is taken off (vibration.py).
+    `rejected` counts samples that were not finite, or came twice. `trusted`: whether they are to be used. `parted`:
+    whether the fast part of any is known. `shares` (2,): how much of the fast part of force and rate is the unit's
+    alone, and is taken off (vibration.py).
     """
 
     def __init__(self) -> None:
         self._t = np.empty(1024)
         # Force, rate, the fast part of both, and the camera's sudden turn.
         self._values = np.zeros((1024, 13))
-        self._parted = False
+        self.parted = False
         self.shares = np.zeros(2)
         self._count = 0
         self._noise_s = -np.inf
@@ -57,7 +58,7 @@ class Samples:
         """
         sound = np.isfinite(times_s) & np.isfinite(values).all(1) & (np.abs(values) < 1e4).all(1)
         self.rejected += int(len(sound) - sound.sum())
-        self._parted |= fast is not None
+        self.parted |= fast is not None
         values = np.hstack((values, np.zeros((len(values), 7)) if fast is None else fast))
         times_s, values = times_s[sound], values[sound]
         if not len(times_s):
@@ -86,11 +87,11 @@ class Samples:
             self._t[:kept], self._values[:kept] = self._t[first : self._count], self._values[first : self._count]
             self._count = kept
 
-    def between(self, start_s: float, end_s: float, known_s: float) -> tuple[Floats, Floats, Bools, Floats | None]:
-        """Give the grid (M,) from start_s to end_s, the values (M, 6) there, and which intervals are told (M - 1,).
+    def between(self, start_s: float, end_s: float, known_s: float) -> tuple[Floats, Floats, Bools]:
+        """Give the grid (M,) from start_s to end_s, the values (M, 13) there, and which intervals are told (M - 1,).
 
-        The values are without `shares` of their fast part, which comes last with the camera's sudden turn (M, 7), None
-        where they are not known. known_s: nothing later than this is looked at, so that more samples do not change the
+        The values: force and rate without `shares` of their fast part, that part, and the camera's sudden turn; 0 where
+        they are not known. known_s: nothing later than this is looked at, so that more samples do not change the
         answer.
         """
         last = int(np.searchsorted(self.times_s, known_s, side="right"))
@@ -98,7 +99,7 @@ class Samples:
         first, stop = int(np.searchsorted(t, start_s, side="right")), int(np.searchsorted(t, end_s, side="left"))
         ends = np.array((start_s, end_s))
         if last == 0 or not self.trusted:
-            return ends, np.zeros((2, 6)), np.zeros(1, dtype=bool), None
+            return ends, np.zeros((2, 13)), np.zeros(1, dtype=bool)
         grid = np.concatenate(((start_s,), t[first:stop], (end_s,)))
         right = np.clip(np.searchsorted(t, ends), 1, max(last - 1, 1))
         if last == 1:
@@ -113,10 +114,9 @@ class Samples:
         after = t[np.minimum(np.arange(first, stop + 1), last - 1)]
         late = np.maximum(grid[1:] - t[last - 1], 0.0) + np.maximum(t[0] - grid[:-1], 0.0)
         told = (after - before < GAP_S) & (late < 0.5 * GAP_S)
-        if not self._parted:
-            return grid, at[:, :6], told, None
-        fast = at[:, 6:]
-        return grid, at[:, :6] - np.repeat(self.shares, 3) * fast[:, :6], told, fast
+        if self.shares.any():
+            at[:, :6] -= np.repeat(self.shares, 3) * at[:, 6:12]
+        return grid, at, told
 
     def slow_rate(self, time_s: float, known_s: float) -> Floats | None:
         """Give the mean turn rate (3,) of SLOW_S until known_s or shortly after time_s, None where there is none.

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
@@ -39,8 +40,10 @@ from buddyline.solver_service.track.state import (
     place_covariance,
 )
 from buddyline.solver_service.track.strapdown import (
-    Increment,
+    Carried,
+    Increments,
     Noise,
+    SampleGrid,
     guessed_noise,
     integrate,
     moved_by_shares,
@@ -49,6 +52,7 @@ from buddyline.solver_service.track.strapdown import (
     propagate,
 )
 from buddyline.solver_service.track.trail import Chosen, Look, Step
+from numpy.typing import NDArray
 
 # How far past an event samples may lie and still count for it: the unit's delay, and one sample to interpolate to.
 HOLD_S: Final = 0.05
@@ -80,6 +84,7 @@ MOST_GAP_RATE: Final = 4.0
 # A wide estimate takes its lights in so many steps.
 ABOUT_STEPS: Final = 4
 _STILL: Final = np.eye(MOVING)
+Number = TypeVar("Number", np.float64, np.bool_)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -94,18 +99,39 @@ class PassGuide:
     look: Look
 
 
-def increment(samples: Samples, state: State, node: int, from_s: float, to_s: float) -> Increment:
-    """Integrate the samples of one node of a pair's state from one time to the next, by its own clock's delay."""
-    shift = min(max(float(state.delay_s[node]), -MAX_DELAY_S), MAX_DELAY_S)
+def increments(
+    of_nodes: Sequence[Samples], state: Carried, from_s: float, to_s: float, *, by_shares: bool = False
+) -> Increments:
+    """Integrate the samples of a state's nodes from one time to the next, each by its own clock's delay.
+
+    by_shares: whether to tell what shares of the samples' fast parts do.
+    """
     known_s = to_s + HOLD_S
-    grid, values, told, fast = samples.between(from_s + shift, to_s + shift, known_s)
-    without = not told.any() and not samples.near(to_s + shift, known_s)
-    if without:
-        values = np.zeros_like(values)
-    slow = [samples.slow_rate(each_s, known_s) for each_s in (from_s + shift, to_s + shift)]
-    ends = [values[i, 3:] if each is None else each for i, each in zip((0, -1), slow, strict=True)]
-    part = integrate(state, node, grid, values[:, :3], values[:, 3:], told, np.stack(ends), fast)
-    return replace(part, without=True) if without else part
+    without = np.zeros(len(of_nodes), dtype=bool)
+    slow = np.empty((len(of_nodes), 2, 3))
+    grids, values, told = [], [], []
+    for node, (samples, delay_s) in enumerate(zip(of_nodes, state.delay_s.tolist(), strict=True)):
+        shift = min(max(delay_s, -MAX_DELAY_S), MAX_DELAY_S)
+        times_s, at, covered = samples.between(from_s + shift, to_s + shift, known_s)
+        without[node] = not covered.any() and not samples.near(to_s + shift, known_s)
+        if without[node]:
+            at[:, :6] = 0.0
+        for end, each_s in ((0, from_s + shift), (-1, to_s + shift)):
+            rate = samples.slow_rate(each_s, known_s)
+            slow[node, end] = at[end, 3:6] if rate is None else rate
+        grids.append(times_s)
+        values.append(at)
+        told.append(covered)
+    every = _padded(values)
+    fast = every[..., 6:12] if by_shares and any(samples.parted for samples in of_nodes) else None
+    parts = integrate(state, SampleGrid(_padded(grids), every[..., :6], _padded(told), slow, fast))
+    return replace(parts, without=without, sudden_rad=every[..., 12].max(axis=1))
+
+
+def _padded(rows: Sequence[NDArray[Number]]) -> NDArray[Number]:
+    """Give nodes' rows (N, M, ...), the last one repeated where another node has more: intervals of no length."""
+    most = max(map(len, rows))
+    return np.stack([row if len(row) == most else row[np.minimum(np.arange(most), len(row) - 1)] for row in rows])
 
 
 class TrackSteps(TrackIntake):
@@ -123,14 +149,13 @@ class TrackSteps(TrackIntake):
         self._keep_s = keep_s
         self._ports = np.stack([node.rig.depth_port_m for node in nodes])
 
-    def increments(self, estimate: Estimate, t_s: float) -> tuple[Increment, Increment]:
+    def increments(self, estimate: Estimate, t_s: float) -> Increments:
         """Integrate both nodes from the estimate's time to t_s."""
-        a, b = (increment(self.samples[node], estimate.state, node, estimate.t_s, t_s) for node in (0, 1))
-        return a, b
+        return increments(self.samples, estimate.state, estimate.t_s, t_s, by_shares=estimate.learns)
 
-    def _with_sudden(self, variances: Floats, parts: tuple[Increment, Increment]) -> Floats:
+    def _with_sudden(self, variances: Floats, sudden_rad: Floats) -> Floats:
         """Give the variances (3,) of shaking with what the shares take off a camera's own sudden turns."""
-        lost = [samples.shares[1] * part.sudden_rad for samples, part in zip(self.samples, parts, strict=True)]
+        lost = [samples.shares[1] * turn for samples, turn in zip(self.samples, sudden_rad, strict=True)]
         widened: Floats = variances + np.square((*lost, 0.0))
         return widened
 
@@ -155,45 +180,46 @@ class TrackSteps(TrackIntake):
         a, b = self._noises(estimate, t_s)
         noises = self._startled(estimate, after, F, 0, a, t_s), self._startled(estimate, after, F, 1, b, t_s)
         learned = estimate.shaking.variances
-        shaking = self._with_sudden(learned, parts)
+        shaking = self._with_sudden(learned, parts.sudden_rad)
         Q, walk, shaken = process_noise(after, parts, noises, shaking, span_s)
         onward = F[:, :MOVING]
         estimate.shaken = onward @ estimate.shaken @ onward.T + (learned / shaking)[:, None, None] * shaken
-        if parts[0].by_fast is not None or parts[1].by_fast is not None:
+        if parts.by_fast is not None:
             by_shares = estimate.by_shares.copy()
-            by_shares[:MOVING] = F @ estimate.by_shares + moved_by_shares(after, parts)
+            by_shares[:MOVING] = F @ estimate.by_shares + moved_by_shares(after, parts.by_fast)
             estimate.by_shares = by_shares
+        without_a, without_b = parts.without.tolist()
         if self._follows_walk(estimate):
             guessed = self._guessed(after, parts, (a, b), noises, span_s)
-            estimate.walking = estimate.walking.stepped(F, walk, (not parts[0].without, not parts[1].without), guessed)
-        for node, part in enumerate(parts):
-            if part.without != estimate.without[node]:
+            estimate.walking = estimate.walking.stepped(F, walk, (not without_a, not without_b), guessed)
+        for node, without in enumerate((without_a, without_b)):
+            if without != estimate.without[node]:
                 # The unit has stopped, or come back: its constants and what stands in their place are told anew.
-                estimate.without[node] = part.without
+                estimate.without[node] = without
                 walk[GYRO_BIAS[node].start - MOVING : GYRO_BIAS[node].stop - MOVING] += WITHOUT_RADPS**2
                 walk[MOUNT[node].start - MOVING : MOUNT[node].stop - MOVING] += WITHOUT_RAD**2
         estimate.covariance = predicted(estimate.covariance, F, Q, walk)
         estimate.state, estimate.t_s = after, t_s
-        estimate.rates_radps = np.stack((parts[0].rate_radps, parts[1].rate_radps))
+        estimate.rates_radps = parts.rate_radps
         return F, Q, walk
 
     @staticmethod
     def _follows_walk(estimate: Estimate) -> bool:
         """Whether derivatives by the walks are carried along: from when they are first learned on, without a break."""
-        if estimate.confirmed and estimate.learns_walk and estimate.covariance[CLOCK, CLOCK] < KNOWN_CLOCK_S**2:
+        if estimate.confirmed and estimate.learns and estimate.covariance[CLOCK, CLOCK] < KNOWN_CLOCK_S**2:
             estimate.follows_walk = True
         return estimate.follows_walk
 
     @staticmethod
     def _guessed(
         after: State,
-        parts: tuple[Increment, Increment],
+        parts: Increments,
         noises: tuple[Noise, Noise],
         taken: tuple[Noise, Noise],
         span_s: float,
     ) -> Floats | None:
         """Give what the learned walks of nodes without units add in a step; of a sudden turn, nothing is learned."""
-        if not (parts[0].without or parts[1].without):
+        if not parts.without.any():
             return None
         guessed = guessed_noise(parts, noises, span_s)
         if taken != noises:
@@ -473,7 +499,7 @@ class TrackSteps(TrackIntake):
             estimate.steps.append(first)
 
     def _predict(
-        self, estimate: Estimate, t_s: float, least_s: float = 0.0, parts: tuple[Increment, Increment] | None = None
+        self, estimate: Estimate, t_s: float, least_s: float = 0.0, parts: Increments | None = None
     ) -> tuple[State, Floats]:
         """Return state and covariance at t_s. parts: `increments` to there, where they are known already."""
         span_s = t_s - estimate.t_s
@@ -481,7 +507,7 @@ class TrackSteps(TrackIntake):
             return estimate.state, estimate.covariance
         parts = self.increments(estimate, t_s) if parts is None else parts
         after, F = propagate(estimate.state, parts, span_s)
-        shaking = self._with_sudden(estimate.shaking.variances, parts)
+        shaking = self._with_sudden(estimate.shaking.variances, parts.sudden_rad)
         Q, walk, _ = process_noise(after, parts, self._noises(estimate, t_s), shaking, span_s)
         return after, predicted(estimate.covariance, F, Q, walk)
 

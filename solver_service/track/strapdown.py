@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final, TypeAlias
+from typing import Final, Protocol, TypeAlias
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, skew
@@ -70,150 +70,205 @@ class Noise:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Increment:
-    """What one node's samples say between two times, and how its constants bear on it.
+# Where an increment's errors stand in its Jacobian: of the node's own attitude and constants.
+_PHI, _GYRO_BIAS, _ACCEL_BIAS, _MOUNT, _LEVER = (slice(k, k + 3) for k in range(0, 15, 3))
+_DELAY: Final = 15
+OWN: Final = 16
+# Where a pair's increments, their rows and columns as in their Jacobians, stand in its transition. A's motion counts
+# against B's.
+_ROWS: Final = np.array([np.r_[PHI[node], V_, R_] for node in (0, 1)])[:, :, None]
+_COLUMNS: Final = np.array(
+    [np.r_[PHI[node], GYRO_BIAS[node], ACCEL_BIAS[node], MOUNT[node], LEVER[node], DELAY[node]] for node in (0, 1)]
+)[:, None, :]
+_SIGNS: Final = np.ones((2, 9, 1))
+_SIGNS[0, 3:] = -1.0
 
-    R: its attitude at the end. dv_mps, dp_m (3,): its velocity gained, and its way gained over moving on unaccelerated
-    (gravity left in: it cancels between the nodes). jacobian (9, SIZE): of attitude (left), dv, dp by the node's own
-    attitude at the start and constants. gap_s: how much of the time no sample covers. rate_radps (3,): the turn rate
-    at the end. without: whether there is no unit at all: the gyro's bias is then minus the turn rate. by_fast (9, 2):
-    what a share of the fast part of force and of rate does to the same as the jacobian's rows; None where not known.
-    sudden_rad: how far the camera itself may have turned as fast.
+
+class Carried(Protocol):
+    """What the strapdown of nodes (N) starts from: attitudes (N, 3, 3), and constants (N, 3), (N,)."""
+
+    @property
+    def R(self) -> Floats:
+        """Of each camera to level."""
+
+    @property
+    def gyro_bias_radps(self) -> Floats:
+        """Camera axes, as all constants."""
+
+    @property
+    def accel_bias_mps2(self) -> Floats:
+        """What the accelerometers show too much."""
+
+    @property
+    def mount_rad(self) -> Floats:
+        """The small turns from the units' axes, as stated, to the true ones."""
+
+    @property
+    def lever_m(self) -> Floats:
+        """The units' places."""
+
+    @property
+    def delay_s(self) -> Floats:
+        """The units' stamps minus true time."""
+
+
+@dataclass(frozen=True, eq=False)
+class SampleGrid:
+    """Samples of nodes (N) between two times, at points (M) of each node's own grid, in camera axes, uncorrected.
+
+    times_s (N, M); values (N, M, 6): force and rate there. told (N, M - 1): whether the accelerometer covers each
+    interval; where not, the node moves on unaccelerated. slow_radps (N, 2, 3): the turn rates at both ends without
+    shaking. Delay and lever arm are told by them: by rates that are themselves shaken both would be fitted to the
+    shaking. fast (N, M, 6): the fast part of the values; None where it is not asked for.
+    """
+
+    times_s: Floats
+    values: Floats
+    told: Bools
+    slow_radps: Floats
+    fast: Floats | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Increments:
+    """What nodes' samples (N nodes) say between two times, and how their constants bear on it.
+
+    R (N, 3, 3): attitudes at the end. dv_mps, dp_m (N, 3): velocity gained, and way gained over moving on
+    unaccelerated (gravity left in: it cancels between the nodes). jacobian (N, 9, OWN): of attitude (left), dv, dp by
+    the node's own attitude at the start, gyro bias, accelerometer bias, mount, lever arm and delay. gap_s (N,): how
+    much of the time no sample covers. rate_radps (N, 3): the turn rates at the end. by_fast (N, 9, 2): what a share of
+    the fast part of force and of rate does to the same as the jacobian's rows; None where not known. without (N,):
+    whether there is no unit at all: the gyro's bias is then minus the turn rate. sudden_rad (N,): how far the camera
+    itself may have turned as fast.
     """
 
     R: Floats
     dv_mps: Floats
     dp_m: Floats
     jacobian: Floats
-    gap_s: float
+    gap_s: Floats
     rate_radps: Floats
-    without: bool = False
-    by_fast: Floats | None = None
-    sudden_rad: float = 0.0
+    by_fast: Floats | None
+    without: Bools
+    sudden_rad: Floats
 
 
-def integrate(
-    state: State,
-    node: int,
-    grid_s: Floats,
-    force_mps2: Floats,
-    rate_radps: Floats,
-    told: Bools,
-    slow_radps: Floats,
-    fast: Floats | None = None,
-) -> Increment:
-    """Integrate one node's samples over a grid (M,) with values (M, 3) at its points, in camera axes, uncorrected.
-
-    told (M - 1,): whether the accelerometer covers each interval; where not, the node moves on unaccelerated.
-    slow_radps (2, 3): the turn rates at both ends without shaking, uncorrected. Delay and lever arm are told by them:
-    by rates that are themselves shaken both would be fitted to the shaking. fast (M, 7): the fast part of force and
-    rate, and the camera's sudden turn.
-    """
-    R0 = state.R[node]
+def integrate(state: Carried, grid: SampleGrid) -> Increments:
+    """Integrate the samples of nodes (N), each over its own grid."""
+    R0, t, told = state.R, grid.times_s, grid.told
+    count, points = t.shape
+    # 1 for nodes whose intervals are all told.
+    whole: Floats = np.asarray(told.all(axis=1, keepdims=True), np.float64)
     # Where no sample tells at all, bias and mount stand for other things (process_noise).
-    mount = rotation_exp(state.mount_rad[node]) if told.any() else _IDENTITY
-    w = (rate_radps - state.gyro_bias_radps[node]) @ mount.T
-    f = (force_mps2 - state.accel_bias_mps2[node]) @ mount.T
-    h = np.diff(grid_s)
-    slow = (slow_radps - state.gyro_bias_radps[node]) @ mount.T
-    w_mid, f_mid = 0.5 * (w[1:] + w[:-1]), 0.5 * (f[1:] + f[:-1])
-    halves = rotation_exp(0.5 * h[:, None] * w_mid)
-    starts, R = np.empty((len(h), 3, 3)), R0
-    for j, turn in enumerate(halves @ halves):
-        starts[j] = R
-        R = R @ turn
+    mount = rotation_exp(state.mount_rad * told.any(axis=1, keepdims=True))
+    to_true = np.swapaxes(mount, 1, 2)
+    biases = np.concatenate((state.accel_bias_mps2, state.gyro_bias_radps), axis=1)
+    unbiased = (grid.values - biases[:, None]).reshape(count, 2 * points, 3)
+    values = (unbiased @ to_true).reshape(count, points, 6)
+    slow = (grid.slow_radps - state.gyro_bias_radps[:, None]) @ to_true
+    h = t[:, 1:] - t[:, :-1]
+    middle = 0.5 * (values[:, 1:] + values[:, :-1])
+    f_mid, w_mid = middle[:, :, :3], middle[:, :, 3:]
+    halves = rotation_exp(0.5 * h[:, :, None] * w_mid)
+    turns = halves @ halves
+    starts, R = np.empty_like(turns), R0
+    for j in range(points - 1):
+        starts[:, j] = R
+        R = R @ turns[:, j]
     R, R_mid = orthonormal(R), starts @ halves
     # Once over all that is turned to level: mount, the crosses with rate and force, force.
-    inner = np.empty((len(h), 3, 10))
-    inner[:, :, 0:3], inner[:, :, 3:6], inner[:, :, 6:9] = mount, skew(w_mid), skew(f_mid)
-    inner[:, :, 9] = f_mid
+    inner = np.empty((count, points - 1, 3, 10))
+    inner[..., 0:3], inner[..., 3:6], inner[..., 6:9] = mount[:, None], skew(w_mid), skew(f_mid)
+    inner[..., 9] = f_mid
     turned = R_mid @ inner
-    whole_told = bool(told.all())
-    u = turned[:, :, 9] if whole_told else np.where(told[:, None], turned[:, :, 9], _AT_REST_MPS2)
-    to_end = grid_s[-1] - 0.5 * (grid_s[1:] + grid_s[:-1])
-    weights = np.stack((h, h * to_end))
-    span = float(grid_s[-1] - grid_s[0])
+    u = np.where(told[:, :, None], turned[..., 9], _AT_REST_MPS2)
+    to_end = t[:, -1:] - 0.5 * (t[:, 1:] + t[:, :-1])
+    weights = np.stack((h, h * to_end), axis=1)
+    span = t[:, -1:] - t[:, :1]
     # Where no sample tells, the rates are an attitude filter's: it has a drift, but no mount, delay or lever arm.
-    lever = state.lever_m[node] if whole_told else np.zeros(3)
-    spin0, spin1 = np.array((R0, R)) @ skew(w[[0, -1]])
-    arm0, arm1 = spin0 @ lever, spin1 @ lever
-    swing = R @ lever - R0 @ lever - arm0 * span
-    dv, dp = weights @ u
-    dv = dv - (arm1 - arm0)
-    dp = dp - swing
+    ends = np.stack((R0, R), axis=1)
+    lever = (state.lever_m * whole)[:, None, :, None]
+    arms = (ends @ skew(values[:, [0, -1], 3:]) @ lever)[..., 0]
+    placed = (ends @ lever)[..., 0]
+    swept = np.stack((arms[:, 1] - arms[:, 0], placed[:, 1] - placed[:, 0] - arms[:, 0] * span), axis=1)
+    gained = weights @ u - swept
 
     # The attitude's error by gyro bias, mount and delay: at the middle of each interval, and at the end.
-    passed = 1.0 - to_end / max(span, 1e-9)
-    slow_turned = (R_mid @ (slow[0] + passed[:, None] * (slow[1] - slow[0]))[:, :, None])[:, :, 0]
-    steps = turned[:, :, :6] * -h[:, None, None]
-    if not whole_told:
-        steps[:, :, 3:] *= told[:, None, None]
-    whole = np.add.accumulate(steps, axis=0)
-    by_attitude = np.empty((len(h), 3, 7))
-    by_attitude[:, :, :6] = whole - 0.5 * steps
-    by_attitude[:, :, 6] = (slow_turned - R0 @ slow[0]) * whole_told
-    force_error = skew(-u) @ by_attitude
-    force_error[:, :, 3:6] -= turned[:, :, 6:9]
+    passed = 1.0 - to_end / np.maximum(span, 1e-9)
+    slow_mid = slow[:, :1] + passed[:, :, None] * (slow[:, 1:] - slow[:, :1])
+    slow_turned = (R_mid @ slow_mid[..., None])[..., 0]
+    slow_ends = (ends @ slow[..., None])[..., 0]
+    steps = turned[..., :6] * -h[:, :, None, None]
+    steps[..., 3:] *= told[:, :, None, None]
+    summed = np.add.accumulate(steps, axis=1)
+    by_attitude = np.empty((count, points - 1, 3, 7))
+    by_attitude[..., :6] = summed - 0.5 * steps
+    by_attitude[..., 6] = (slow_turned - slow_ends[:, :1]) * whole[:, :, None]
+    by_turning = skew(-u)
+    force_error = by_turning @ by_attitude
+    force_error[..., 3:6] -= turned[..., 6:9]
     # Force changes as its axes turn, -w x f: gravity is nearly all of it.
-    force_error[:, :, 6] += (skew(turned[:, :, 9]) @ slow_turned[:, :, None])[:, :, 0]
-    of_force = weights * told
-    both = (of_force @ force_error.reshape(len(h), 21)).reshape(2, 3, 7)
-    by_bias = -(of_force @ turned[:, :, :3].reshape(len(h), 9)).reshape(2, 3, 3)
+    force_error[..., 6] += (skew(turned[..., 9]) @ slow_turned[..., None])[..., 0]
+    of_force = weights * told[:, None]
+    both = (of_force @ force_error.reshape(count, points - 1, 21)).reshape(count, 2, 3, 7)
+
+    J = np.zeros((count, 9, OWN))
+    J[:, 0:3, _PHI] = _IDENTITY
+    J[:, 0:3, _GYRO_BIAS] = summed[:, -1, :, :3]
+    J[:, 0:3, _MOUNT] = summed[:, -1, :, 3:]
+    J[:, 0:3, _DELAY] = (slow_ends[:, 1] - slow_ends[:, 0]) * whole
+    moved = np.zeros((count, 2, 3, OWN))
     # An error of attitude at the start turns all that the samples say, the lever arm's part excepted.
-    by_turn = skew(np.array((arm1 - arm0, swing)) - of_force @ u)
-
-    J = np.zeros((9, SIZE))
-    J[0:3, PHI[node]] = _IDENTITY
-    J[0:3, GYRO_BIAS[node]] = whole[-1, :, :3]
-    J[0:3, MOUNT[node]] = whole[-1, :, 3:6]
-    J[0:3, DELAY[node]] = (R @ slow[1] - R0 @ slow[0]) * whole_told
-    for row, block in ((3, 0), (6, 1)):
-        rows = slice(row, row + 3)
-        J[rows, PHI[node]] = by_turn[block]
-        J[rows, GYRO_BIAS[node]] = both[block][:, :3]
-        J[rows, MOUNT[node]] = both[block][:, 3:6]
-        J[rows, DELAY[node]] = both[block][:, 6]
-        J[rows, ACCEL_BIAS[node]] = by_bias[block]
+    moved[..., _PHI] = skew(swept - of_force @ u)
+    moved[..., _GYRO_BIAS], moved[..., _MOUNT], moved[..., _DELAY] = both[..., :3], both[..., 3:6], both[..., 6]
+    by_bias = of_force @ turned[..., :3].reshape(count, points - 1, 9)
+    moved[..., _ACCEL_BIAS] = -by_bias.reshape(count, 2, 3, 3)
     # The lever arm's part is a difference of end points; of its errors, its own and the attitude's count.
-    if whole_told:
-        slow0, slow1 = np.array((R0, R)) @ skew(slow)
-        J[3:6, LEVER[node]] = slow0 - slow1
-        J[6:9, LEVER[node]] = R0 + slow0 * span - R
-    gap = float(h @ ~told)
+    spun = ends @ skew(slow) * whole[:, :, None, None]
+    moved[:, 0, :, _LEVER] = spun[:, 0] - spun[:, 1]
+    moved[:, 1, :, _LEVER] = (R0 - R) * whole[:, :, None] + spun[:, 0] * span[:, :, None]
+    J[:, 3:] = moved.reshape(count, 6, OWN)
+
     by_fast = None
-    if fast is not None and whole_told:
-        fast_mid = 0.5 * (fast[1:] + fast[:-1])
-        by_force, by_rate = (
-            -(turned[:, :, :3] @ part[:, :, None])[:, :, 0] for part in (fast_mid[:, :3], fast_mid[:, 3:6])
-        )
-        turns = by_rate * h[:, None]
-        swung = np.add.accumulate(turns, axis=0)
-        tipped = np.cross(-u, swung - 0.5 * turns)
-        by_fast = np.zeros((9, 2))
-        by_fast[0:3, 1] = swung[-1]
-        by_fast[3:9, 0] = (weights @ by_force).ravel()
-        by_fast[3:9, 1] = (weights @ tipped).ravel()
-    sudden_rad = 0.0 if fast is None else float(fast[:, 6].max())
-    return Increment(R, dv, dp, J, gap, w[-1], by_fast=by_fast, sudden_rad=sudden_rad)
+    if grid.fast is not None and whole.any():
+        fast_mid = 0.5 * (grid.fast[:, 1:] + grid.fast[:, :-1]).reshape(count, points - 1, 2, 3)
+        by_share = -(turned[..., :3] @ np.swapaxes(fast_mid, 2, 3))
+        by_turn = by_share[..., 1] * h[:, :, None]
+        swung = np.add.accumulate(by_turn, axis=1)
+        tipped = (by_turning @ (swung - 0.5 * by_turn)[..., None])[..., 0]
+        by_fast = np.zeros((count, 9, 2))
+        by_fast[:, 0:3, 1] = swung[:, -1]
+        by_fast[:, 3:, 0] = (weights @ by_share[..., 0]).reshape(count, 6)
+        by_fast[:, 3:, 1] = (weights @ tipped).reshape(count, 6)
+        by_fast *= whole[:, :, None]
+    return Increments(
+        R=R,
+        dv_mps=gained[:, 0],
+        dp_m=gained[:, 1],
+        jacobian=J,
+        gap_s=np.add.reduce(h * ~told, axis=1),
+        rate_radps=values[:, -1, 3:],
+        by_fast=by_fast,
+        without=np.zeros(count, dtype=bool),
+        sudden_rad=np.zeros(count),
+    )
 
 
-def propagate(state: State, parts: tuple[Increment, Increment], span_s: float) -> tuple[State, Floats]:
+def propagate(state: State, parts: Increments, span_s: float) -> tuple[State, Floats]:
     """Move the state by both nodes' increments; return it and the rows (MOVING, SIZE) of its transition that are not 1.
 
     The errors are those of `State.plus`, at both ends. What the units were shaken by at the start is in the increments;
     a share of it is still there at the end (shaking.py).
     """
-    a, b = parts
     kept = kept_share(span_s)
-    dv, dp = b.dv_mps - a.dv_mps, b.dp_m - a.dp_m
+    dv, dp = parts.dv_mps[1] - parts.dv_mps[0], parts.dp_m[1] - parts.dp_m[0]
     gone, back_s = 1.0 - kept, span_s - SHAKEN_S * (1.0 - kept)
     # Without a unit nothing is shaken.
-    felt = np.array([not part.without for part in parts], dtype=np.float64)
+    felt = (~parts.without).astype(np.float64)
     shake = felt[:, None] * state.shake_rad
     shove = felt.max() * state.shove_mps
     off = rotation_exp((state.R @ shake[:, :, None])[:, :, 0])
-    R = off @ np.stack((a.R, b.R)) @ rotation_exp(-kept * shake)
+    R = off @ parts.R @ rotation_exp(-kept * shake)
     after = replace(
         state,
         r_m=state.r_m + state.v_mps * span_s + back_s * shove + dp,
@@ -223,9 +278,7 @@ def propagate(state: State, parts: tuple[Increment, Increment], span_s: float) -
         shove_mps=kept * state.shove_mps,
     )
     F = np.zeros((MOVING, SIZE))
-    F[R_] = b.jacobian[6:9] - a.jacobian[6:9]
-    F[V_] = b.jacobian[3:6] - a.jacobian[3:6]
-    F[PHI[0]], F[PHI[1]] = a.jacobian[0:3], b.jacobian[0:3]
+    F[_ROWS, _COLUMNS] = _SIGNS * parts.jacobian
     F[R_, R_] = F[V_, V_] = _IDENTITY
     F[R_, V_] = span_s * _IDENTITY
     F[R_, SHOVE] = felt.max() * back_s * _IDENTITY
@@ -238,60 +291,58 @@ def propagate(state: State, parts: tuple[Increment, Increment], span_s: float) -
     return after, invariant_of_plain(after) @ F
 
 
-def moved_by_shares(after: State, parts: tuple[Increment, Increment]) -> Floats:
-    """Give how a step's end is moved by a share of 1 of each fast part (MOVING, 4), in the errors of `State.plus`."""
+def moved_by_shares(after: State, by_fast: Floats) -> Floats:
+    """Give how a step's end is moved by a share of 1 of each fast part (MOVING, 4), in the errors of `State.plus`.
+
+    by_fast (2, 9, 2): as in Increments.
+    """
     moved = np.zeros((MOVING, 4))
-    for node, part in enumerate(parts):
-        if part.by_fast is not None:
-            columns = slice(2 * node, 2 * node + 2)
-            sign = 1.0 if node else -1.0
-            moved[PHI[node], columns] = part.by_fast[0:3]
-            moved[V_, columns] = sign * part.by_fast[3:6]
-            moved[R_, columns] = sign * part.by_fast[6:9]
+    for node in (0, 1):
+        moved[_ROWS[node, :, 0], 2 * node : 2 * node + 2] = _SIGNS[node] * by_fast[node]
     return invariant_of_plain(after) @ moved
 
 
 def process_noise(
-    after: State, parts: tuple[Increment, Increment], noises: tuple[Noise, Noise], shaking: Floats, span_s: float
+    after: State, parts: Increments, noises: tuple[Noise, Noise], shaking: Floats, span_s: float
 ) -> tuple[Floats, Floats, Floats]:
     """Give what a step adds to the covariance: of the moving errors (MOVING, MOVING), and of each other error
     (SIZE-MOVING,); and the parts in the first that shaking of the variances (3,) adds, (3, MOVING, MOVING)."""
-    a, b = parts
     Q = np.zeros((MOVING, MOVING))
+    without = parts.without.tolist()
     walk = np.zeros(SIZE)
     force = 0.0
-    for node, (part, noise) in enumerate(zip(parts, noises, strict=True)):
+    for node, (gap_s, noise) in enumerate(zip(parts.gap_s.tolist(), noises, strict=True)):
         force += noise.accel_mps**2 * span_s
         walk[ACCEL_BIAS[node]] = noise.accel_bias_mps2**2 * span_s
-        if not part.without:
-            force += noise.gap_accel_mps**2 * part.gap_s
-            turn = noise.gyro_rad**2 * span_s + noise.gap_gyro_rad**2 * part.gap_s
+        if not without[node]:
+            force += noise.gap_accel_mps**2 * gap_s
+            turn = noise.gyro_rad**2 * span_s + noise.gap_gyro_rad**2 * gap_s
             Q[PHI[node], PHI[node]] = turn * _IDENTITY
             walk[GYRO_BIAS[node]] = noise.gyro_bias_radps**2 * span_s
     _accelerated(Q, force, span_s)
-    if a.without or b.without:
+    if any(without):
         whole = guessed_noise(parts, noises, span_s).sum(axis=0)
         Q += whole[:MOVING, :MOVING]
         walk += np.diag(whole) * _CONSTANT
     shaken = shaking_noise(after.R, shaking, span_s)
-    for k, without in enumerate((a.without, b.without, a.without and b.without)):
-        if without:
+    for k, still in enumerate((*without, all(without))):
+        if still:
             shaken[k, :NAV] = shaken[k, :, :NAV] = 0.0
     T = invariant_of_plain(after)
     shaken = T @ shaken @ T.T
     return T @ Q @ T.T + shaken.sum(axis=0), walk[MOVING:], shaken
 
 
-def guessed_noise(parts: tuple[Increment, Increment], noises: tuple[Noise, Noise], span_s: float) -> Floats:
+def guessed_noise(parts: Increments, noises: tuple[Noise, Noise], span_s: float) -> Floats:
     """Give what a step adds to the plain errors' covariance where nodes have no unit, (3, SIZE, SIZE).
 
     By their acceleration, by their turn rates' walk, and by that of their attitudes' slow error.
     """
     guessed = np.zeros((3, SIZE, SIZE))
     force = 0.0
-    for node, (part, noise) in enumerate(zip(parts, noises, strict=True)):
-        if part.without:
-            force += noise.gap_accel_mps**2 * part.gap_s
+    for node, noise in enumerate(noises):
+        if parts.without[node]:
+            force += noise.gap_accel_mps**2 * float(parts.gap_s[node])
             rate = noise.gap_rate_radps**2 * _IDENTITY
             guessed[1, PHI[node], PHI[node]] = span_s**3 / 3.0 * rate
             guessed[1, GYRO_BIAS[node], GYRO_BIAS[node]] = span_s * rate

@@ -11,7 +11,7 @@ from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rot
 from buddyline.solver_service.network.belief import Member
 from buddyline.solver_service.network.estimate import NetEstimate, PairFix
 from buddyline.solver_service.network.filter import inverted
-from buddyline.solver_service.network.motion import Move, as_first_of_pair, moved_member
+from buddyline.solver_service.network.motion import Move, moved_member
 from buddyline.solver_service.network.sights import columns, light_positions
 from buddyline.solver_service.network.state import (
     ACCEL_BIAS,
@@ -31,7 +31,7 @@ from buddyline.solver_service.network.state import (
 )
 from buddyline.solver_service.track.inputs import TrackNode
 from buddyline.solver_service.track.intake import TrackIntake
-from buddyline.solver_service.track.strapdown import Noise, integrate
+from buddyline.solver_service.track.strapdown import Noise, SampleGrid, integrate
 
 STEP = 1e-6
 LIGHTS_M = np.array(((-0.44, 0.01, 0.02), (0.44, -0.02, 0.01)))
@@ -109,10 +109,10 @@ def test_a_step() -> None:
         whole[block(member)] = error
         moved = state.plus(whole)
         grid, values, slow = samples(moved, member, 0.0)
-        told = np.ones(len(grid) - 1, dtype=bool)
-        part = integrate(as_first_of_pair(moved, member), 0, grid, values[:, :3], values[:, 3:], told, slow)
+        told = np.ones((1, len(grid) - 1), dtype=bool)
+        parts = integrate(moved.chosen([member]), SampleGrid(grid[None], values[None], told, slow[None]))
         noise = Noise(1e-3, 1e-2)
-        fields, found["F"], _, _ = moved_member(moved, member, part, noise, np.full(2, 1e-6), span_s)
+        fields, found["F"], _, _ = moved_member(moved, member, parts, 0, noise, np.full(2, 1e-6), span_s)
         every = {name: getattr(moved, name).copy() for name in fields}
         for name, value in fields.items():
             every[name][member] = value

@@ -28,7 +28,7 @@ from buddyline.solver_service.track.state import (
     place_covariance,
     plain_of_invariant,
 )
-from buddyline.solver_service.track.strapdown import Increment, integrate, propagate
+from buddyline.solver_service.track.strapdown import Increments, SampleGrid, integrate, propagate
 from numpy.typing import NDArray
 
 STEP = 1e-6
@@ -158,15 +158,15 @@ def samples(seed: int) -> tuple[Floats, Floats, Floats]:
     return t, force, turn
 
 
-def increments(state: State) -> tuple[Increment, Increment]:
-    parts = []
+def increments(state: State) -> Increments:
+    grid = np.linspace(0.0, 0.1, 41)
+    values = np.empty((2, 41, 6))
     for node in (0, 1):
         t, force, turn = samples(node)
-        grid = np.linspace(0.0, 0.1, 41)
-        at = grid + state.delay_s[node]
-        values = [np.stack([np.interp(at, t, of[:, axis]) for axis in range(3)], axis=1) for of in (force, turn)]
-        parts.append(integrate(state, node, grid, values[0], values[1], np.ones(40, dtype=bool), values[1][[0, -1]]))
-    return parts[0], parts[1]
+        for column, of in enumerate((*force.T, *turn.T)):
+            values[node, :, column] = np.interp(grid + state.delay_s[node], t, of)
+    told = np.ones((2, 40), dtype=bool)
+    return integrate(state, SampleGrid(np.stack((grid, grid)), values, told, values[:, [0, -1], 3:]))
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -9,7 +9,7 @@ import pytest
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.dive import in_order, parted, pass_over, smooth
 from buddyline.solver_service.track.filter import TrackFilter
-from buddyline.solver_service.track.strapdown import integrate, moved_by_shares, propagate
+from buddyline.solver_service.track.strapdown import SampleGrid, integrate, moved_by_shares, propagate
 from buddyline.solver_service.track.vibration import Shares, fast_part, sudden_turn
 
 from tests.solver_service.track.dives import KnownDive, Setting, make, score
@@ -77,27 +77,22 @@ def test_shares_are_least_squares() -> None:
 def test_what_a_share_moves(column: int) -> None:
     state = a_state(3)
     rng = np.random.default_rng(8)
-    fast = rng.normal(0.0, 0.1, (2, 41, 7))
+    fast = rng.normal(0.0, 0.1, (2, 41, 6))
 
     def after(share: float) -> tuple[object, Floats]:
-        parts = []
+        grid = np.linspace(0.0, 0.1, 41)
+        values = np.empty((2, 41, 6))
         for node in (0, 1):
             t, force, turn = samples(node)
-            grid = np.linspace(0.0, 0.1, 41)
-            values = np.hstack(
-                [np.stack([np.interp(grid, t, of[:, axis]) for axis in range(3)], axis=1) for of in (force, turn)]
-            )
-            taken = np.zeros(6)
-            if column // 2 == node:
-                taken[3 * (column % 2) : 3 * (column % 2) + 3] = share
-            values = values - taken * fast[node, :, :6]
-            ends = values[[0, -1], 3:]
-            told = np.ones(40, dtype=bool)
-            still = replace(state, lever_m=np.zeros((2, 3)))
-            parts.append(integrate(still, node, grid, values[:, :3], values[:, 3:], told, ends, fast[node]))
-        both = parts[0], parts[1]
+            values[node] = np.stack([np.interp(grid, t, of) for of in (*force.T, *turn.T)], axis=1)
+        of_sensor = slice(3 * (column % 2), 3 * (column % 2) + 3)
+        values[column // 2, :, of_sensor] -= share * fast[column // 2, :, of_sensor]
+        told = np.ones((2, 40), dtype=bool)
+        still = replace(state, lever_m=np.zeros((2, 3)))
+        both = integrate(still, SampleGrid(np.stack((grid, grid)), values, told, values[:, [0, -1], 3:], fast))
+        assert both.by_fast is not None
         moved, _ = propagate(still, both, 0.1)
-        return moved, moved_by_shares(moved, both)
+        return moved, moved_by_shares(moved, both.by_fast)
 
     (more, _), (less, _), (middle, moved) = after(1e-3), after(-1e-3), after(0.0)
     numeric = (more.minus(middle) - less.minus(middle)) / 2e-3  # type: ignore[attr-defined]
