@@ -61,6 +61,7 @@ class ZenohSubscription:
         self._repeats = Repeats(history=history)
         self._fetching: dict[threading.Thread, str] = {}
         self._stop = threading.Event()
+        self._asking = zenoh.CancellationToken()
         subscribers = [(key_expr, self._take, self._declare(key_expr)) for key_expr in key_exprs]
         if history:
             beside = [f"{key_expr}/@adv/pub/**" for key_expr in key_exprs]
@@ -84,7 +85,10 @@ class ZenohSubscription:
     def _present(self) -> set[str]:
         """Return the owners of the keys of the nodes on the bus."""
         try:
-            replies = list(self._session.liveliness().get(f"{ALIVE}/node/*/*", timeout=QUERY_S))
+            asked = self._session.liveliness().get(
+                f"{ALIVE}/node/*/*", timeout=QUERY_S, cancellation_token=self._asking
+            )
+            replies = list(asked)
         except zenoh.ZError:
             return set()
         tokens = [str(reply.ok.key_expr).split("/") for reply in replies if reply.ok is not None]
@@ -107,6 +111,8 @@ class ZenohSubscription:
     def close(self) -> None:
         """Let the handler finish the queued messages, for one second at most, and end the threads."""
         self._stop.set()
+        # A hub that stands still answers nothing.
+        self._asking.cancel()  # type: ignore[no-untyped-call]
         self._narrowing.close()
         self._delivery.close()
         with self._lock:
@@ -213,6 +219,7 @@ class ZenohSubscription:
             consolidation=zenoh.ConsolidationMode.NONE,
             accept_replies=zenoh.ReplyKeyExpr.ANY,
             timeout=QUERY_S,
+            cancellation_token=self._asking,
         ):
             if reply.ok is not None and reply.ok.source_info is not None:
                 yield reply.ok

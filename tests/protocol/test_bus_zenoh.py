@@ -19,10 +19,11 @@ from buddyline.protocol import topics
 from buddyline.protocol.bus import Bus
 from buddyline.protocol.connection import Connection
 from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.service import JOIN_TIMEOUT_S
 from buddyline.protocol.zenoh_bus import connect, open_hub, watchdog
 from buddyline.protocol.zenoh_bus import hub as hub_module
 from buddyline.protocol.zenoh_bus import subscription as subscription_module
-from buddyline.protocol.zenoh_bus.session import config_of
+from buddyline.protocol.zenoh_bus.session import RETRY_S, config_of
 from buddyline.protocol.zenoh_bus.settings import client_settings
 
 from tests.processes import PATIENCE_S, free_endpoint, until
@@ -231,6 +232,27 @@ def test_nothing_is_lost_when_the_hub_is_killed_and_comes_back() -> None:
         assert changes == [("node/a", True), ("node/a", False), ("node/a", True)]
         node.close()
         solver.close()
+
+
+def test_a_bus_closes_at_once_while_it_asks_a_hub_that_stands_still() -> None:
+    endpoint = free_endpoint()
+    with hub_process(endpoint) as hub:
+        node, solver = run_client(endpoint), run_client(endpoint)
+        solver.subscribe(topics.EVERYTHING, Inbox())
+        for number in range(6):
+            # Its first samples are missing, and nobody has them.
+            declared = node._session.declare_publisher(f"buddyline/node/x{number}/candidates")
+            declared.put(b"{}", source_info=zenoh.SourceInfo(declared.id, 5))
+        until(lambda: sum(thread.name.startswith("bus fetch") for thread in threading.enumerate()) == 6)
+        hub.send_signal(signal.SIGSTOP)
+        # By then each asks again.
+        time.sleep(2.0 * RETRY_S)
+        begin_s = time.monotonic()
+        solver.close()
+        took_s = time.monotonic() - begin_s
+        hub.send_signal(signal.SIGCONT)
+        node.close()
+    assert took_s < JOIN_TIMEOUT_S
 
 
 def test_what_is_sent_again_while_there_is_no_hub_comes_to_those_who_have_missed_it() -> None:
