@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 # As many as a Candidates message holds.
 _MAX_CANDIDATES: Final = 64
-# No detector finds a light's centre better than this.
-_MIN_SIGMA_PX: Final = 0.05
+# No smaller sigma is believed. Lamps whose cores are not clipped are found to 0.01 px in rendered pictures.
+_MIN_SIGMA_PX: Final = 0.005
 # A score is the probability of a lamp, fitted to pictures (node/detect/score.toml): its log odds count, at most this
 # much either way, because no fit knows every water.
 _MOST_LOG_ODDS: Final = 3.0

@@ -44,6 +44,19 @@ def facing(range_m=4.0, rig_a=IDEAL, rig_b=IDEAL):
     return PairScene(rig_a, rig_b, np.array([0.1, 0.2, range_m]), R, R_ned_a)
 
 
+def test_the_covariance_of_sharp_lights_is_true():
+    rng = np.random.default_rng(5)
+    nees = []
+    for _ in range(150):
+        scene = random_scene(rng, (1.5, 9.0))
+        (a, _), (b, _) = scene.views(rng, 0.01)
+        fix = solve(scene, (a, b))
+        off = error(fix, scene)
+        nees.append(off @ np.linalg.solve(fix.covariance, off))
+    # The mean of 150 chi^2 of six degrees, over six: 1 +- 0.05.
+    assert np.mean(nees) / 6 == pytest.approx(1.0, abs=0.15)
+
+
 @pytest.mark.parametrize("rigs", [(IDEAL, IDEAL), (ODD_A, ODD_B)], ids=["ideal", "odd"])
 @pytest.mark.parametrize("method", ["refined", "exact"])
 def test_perfect_pixels_give_the_pose(rigs, method):
