@@ -15,11 +15,12 @@ import numpy as np
 from buddyline.node.detect.rings import Floats
 
 SIZES: Final = Path(__file__).with_name("sigma.toml")
-NAMES: Final = ("model", "halo", "focal", "growth", "floor_px", "long_px")
+NAMES: Final = ("model", "halo", "lean", "focal", "growth", "floor_px", "long_px")
 """model: factor on the least squares' own sigma. halo, focal: the powers by which it grows with the light's halo (glow
 follows the model less than a core does) and with the focal length (larger pictures show more of what the model leaves
-out). growth: factor on what the unknown growth of the glow does. floor_px: of every source. long_px: per unit of
-elongation above LONG_FROM, because a long core is partly hidden, or two lights merge in it."""
+out). lean: by what share it grows for each unit of the glow's lean, which the model has to take off. growth: factor on
+what the unknown growth of the glow does. floor_px: of every source. long_px: per unit of elongation above LONG_FROM,
+because a long core is partly hidden, or two lights merge in it."""
 LONG_FROM: Final = 1.2
 
 
@@ -27,20 +28,22 @@ class Doubt(NamedTuple):
     """What speaks for an error of N located sources, per axis.
 
     model_px2: variance of the least squares times the model's misfit. growth_px2: from the unknown growth of the glow.
-    halo: radius at 0.3 of the height over that at half of it. focal: focal length over FOCAL_PX, of the picture.
-    elongation: of the core.
+    halo: radius at 0.3 of the height over that at half of it. lean: length of the glow's lean. focal: focal length over
+    FOCAL_PX, of the picture. elongation: of the core.
     """
 
     model_px2: Floats
     growth_px2: Floats
     halo: Floats
+    lean: Floats
     focal: Floats | float
     elongation: Floats
 
 
 def direct_px2(doubt: Doubt, sizes: Mapping[str, float]) -> Floats:
     """Return the variance of the sources, (N,), as far as the model of glow and core tells."""
-    scale = sizes["model"] * doubt.halo ** sizes["halo"] * doubt.focal ** sizes["focal"]
+    leaning = 1.0 + sizes["lean"] * doubt.lean
+    scale = sizes["model"] * doubt.halo ** sizes["halo"] * leaning * doubt.focal ** sizes["focal"]
     return np.asarray(scale**2 * doubt.model_px2 + sizes["growth"] ** 2 * doubt.growth_px2)
 
 

@@ -11,7 +11,7 @@ from buddyline.tools.progress import Progress
 from buddyline.tools.tune import scenes, sigma
 from buddyline.tools.tune.sigma import Errors, truth_of, variance_px2
 
-TRUE = {"model": 0.6, "halo": 1.5, "focal": 0.4, "growth": 1.8, "floor_px": 0.02, "long_px": 0.8}
+TRUE = {"model": 0.6, "halo": 1.5, "lean": 0.8, "focal": 0.4, "growth": 1.8, "floor_px": 0.02, "long_px": 0.8}
 
 
 def errors_of(sizes, seed, count=2_000):
@@ -20,6 +20,7 @@ def errors_of(sizes, seed, count=2_000):
         np.exp(rng.normal(-7.0, 1.5, count)),
         np.exp(rng.normal(-8.0, 2.0, count)),
         rng.uniform(1.0, 1.6, count),
+        rng.exponential(0.5, count),
         rng.choice([1.0, 2.0], count),
         rng.choice([1.0, 1.1, 1.3, 1.5], count),
     )
@@ -37,6 +38,13 @@ def test_the_fit_finds_the_sizes_that_made_the_errors():
     assert nees == pytest.approx(1.0, abs=0.1)
     assert beyond < 0.02
     assert truth_of(errors, found | {"model": 0.3, "growth": 0.9})[0] > 2.0
+
+
+def test_each_lamp_counts_once_with_its_nearest_place():
+    for view in scenes.views("cavern", 1000):
+        lamps = [lamp[:2] for lamp in view.world.lamps(view.node, view.stamp_ns) if lamp[2]]
+        found = sigma.located(view.detector, view.picture, 900.0, np.array(lamps).reshape(-1, 2), "cavern")
+        assert sum(len(one.square_px2) for one in found) <= len(lamps)
 
 
 @pytest.mark.slow

@@ -1,9 +1,9 @@
 """`buddyline tune --fit-sigma`: fit the sigma of located lights to their errors in the simulator's pictures.
 
 The pictures are those of the score's fit (scenes.py), as they are, through a Bayer mosaic, or as JPEG; and those of
-dives with light truth, if any are given, which together count as much: another renderer's water is another water.
-Lights count that are likely, not cut by the border, and where the model of glow and core holds: sigma's other parts are
-not fitted.
+dives with light truth, if any are given: another renderer's waters. Each light counts alike. Lights count that are
+likely, not cut by the border, and where the model of glow and core holds: sigma's other parts are not fitted. Of each
+lamp the nearest counts, because a fragment beside a lamp that is found is no error of its place.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 from buddyline.node.detect.centre import locate_sources
 from buddyline.node.detect.detection import focal_of
+from buddyline.node.detect.lights import distinct
 from buddyline.node.detect.score import probability
 from buddyline.node.detect.sigma import NAMES, Doubt, direct_px2, long_px2
 from buddyline.node.detect.source import SourceDetector
@@ -41,6 +42,7 @@ to doubt all others."""
 RANGES: Final[Mapping[str, tuple[float, float]]] = {
     "model": (0.1, 2.0),
     "halo": (0.0, 4.0),
+    "lean": (0.0, 4.0),
     "focal": (0.0, 1.5),
     "growth": (0.2, 4.0),
     "floor_px": (0.0, 0.1),
@@ -68,17 +70,18 @@ def variance_px2(doubt: Doubt, sizes: Mapping[str, float]) -> Floats:
     return np.asarray(direct_px2(doubt, sizes) + sizes["floor_px"] ** 2 + long_px2(doubt, sizes), np.float64)
 
 
-def fit(*groups: Sequence[Errors]) -> dict[str, float]:
-    """Return the sizes that make the errors likeliest, each within its range: one after the other, until none moves.
+def fit(errors: Sequence[Errors]) -> dict[str, float]:
+    """Return the sizes that make the errors likeliest, each within its range: one after the other, until none moves."""
+    doubt, square_px2 = _together(errors)
 
-    groups: of errors; each counts as much as the others.
-    """
-    together = [_together(group) for group in groups if group]
+    def unlikely(name: str, value: float) -> float:
+        return unlikelihood(doubt, square_px2, {**sizes, name: value})
+
     sizes = {name: 0.5 * sum(RANGES[name]) for name in NAMES}
     for _ in range(ROUNDS):
         before = dict(sizes)
         for name, (low, high) in RANGES.items():
-            sizes[name] = _least(partial(_with, together, sizes, name), low, high)
+            sizes[name] = _least(partial(unlikely, name), low, high)
         if max(abs(sizes[name] - before[name]) / (RANGES[name][1] - RANGES[name][0]) for name in NAMES) < 1e-3:
             break
     return sizes
@@ -88,10 +91,6 @@ def unlikelihood(doubt: Doubt, square_px2: Floats, sizes: Mapping[str, float]) -
     """Return the mean negative logarithm of the errors' likelihood, without its constant."""
     spread = np.maximum(variance_px2(doubt, sizes), 1e-12) * (TAILS - 2.0) / TAILS
     return float(np.mean(np.log(spread) + 0.5 * (TAILS + 2.0) * np.log1p(square_px2 / (TAILS * spread))))
-
-
-def _with(groups: Sequence[tuple[Doubt, Floats]], sizes: Mapping[str, float], name: str, value: float) -> float:
-    return sum(unlikelihood(*group, {**sizes, name: value}) for group in groups)
 
 
 def _least(of: Callable[[float], float], low: float, high: float) -> float:
@@ -131,17 +130,20 @@ def located(
     seen = detector.examine(picture)
     if seen is None or not len(lamps_px):
         return
-    lights = seen.lights
-    counts = (probability(seen.features) >= LIKELY) & ~lights.border_px.any(axis=1)
+    # Of several places on one light the detector keeps the first.
+    apart = np.array(distinct(seen.lights.centre_px, seen.lights.core_px, len(seen.lights.peak)))
+    lights = seen.lights.at(apart)
+    counts = (probability(seen.features[apart]) >= LIKELY) & ~lights.border_px.any(axis=1)
     lights = lights.at(np.flatnonzero(counts & (lights.scattered < MOST_SCATTERED)))
     if not len(lights.peak):
         return
     found = locate_sources(picture, lights, focal_px)
-    away_px = np.linalg.norm(found.centre_px[:, None] - lamps_px, axis=-1).min(axis=1)
-    kept = found.holds & (away_px <= tolerance_px(picture.shape[1]))
-    own = found.doubt
-    focal = np.full(int(kept.sum()), own.focal)
-    doubt = Doubt(own.model_px2[kept], own.growth_px2[kept], own.halo[kept], focal, own.elongation[kept])
+    of_each_px = np.linalg.norm(found.centre_px[:, None] - lamps_px, axis=-1)
+    away_px, lamp = of_each_px.min(axis=1), of_each_px.argmin(axis=1)
+    nearest = of_each_px.argmin(axis=0)[lamp] == np.arange(len(lamp))
+    kept = nearest & found.holds & (away_px <= tolerance_px(picture.shape[1]))
+    own = found.doubt._replace(focal=np.full(len(away_px), found.doubt.focal))
+    doubt = Doubt._make(np.asarray(values)[kept] for values in own)
     yield Errors(source, doubt, away_px[kept].astype(np.float64) ** 2)
 
 
@@ -165,7 +167,8 @@ def run(dives: Sequence[str], known: Iterable[Errors]) -> int:
     """
     others = list(known)
     errors, held_out = to_fit_and_held_out(simulated)
-    sys.stdout.write(described(fit(errors, others), [*errors, *others], held_out, dives))
+    errors += others
+    sys.stdout.write(described(fit(errors), errors, held_out, dives))
     return 0
 
 
@@ -210,7 +213,5 @@ def truth_of(errors: Sequence[Errors], sizes: Mapping[str, float]) -> tuple[floa
 
 
 def _together(errors: Sequence[Errors]) -> tuple[Doubt, Floats]:
-    model, growth, halo, focal, elongation = (
-        np.concatenate([np.asarray(one.doubt[k]) for one in errors]) for k in range(len(Doubt._fields))
-    )
-    return Doubt(model, growth, halo, focal, elongation), np.concatenate([one.square_px2 for one in errors])
+    doubt = Doubt._make(np.concatenate([np.asarray(one.doubt[k]) for one in errors]) for k in range(len(Doubt._fields)))
+    return doubt, np.concatenate([one.square_px2 for one in errors])
