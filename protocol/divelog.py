@@ -221,6 +221,8 @@ class DiveLogReader:
     def __init__(self, path: Path | str, *, trust_index: bool = True) -> None:
         self.path = Path(path)
         self.damage: list[str] = []
+        if self.path.is_dir():
+            raise BuddylineError(f"{self.path}: is a folder; name the logs in it: {self.path / '*.mcap'}")
         try:
             self._size = self.path.stat().st_size
             self._file = open(self.path, "rb")

@@ -251,3 +251,8 @@ def test_an_image_stamp_is_its_publish_time(tmp_path):
         (record,) = reader.records()
         assert record.publish_time_ns == 3_000_000_004
         assert record.open().message == image
+
+
+def test_a_folder_in_place_of_a_log_says_what_to_name(tmp_path):
+    with pytest.raises(BuddylineError, match=r"is a folder; name the logs in it: .*\*\.mcap"):
+        DiveLogReader(tmp_path)

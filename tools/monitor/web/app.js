@@ -245,7 +245,7 @@ function drawPlot(plot) {
     plot.chart = new uPlot({
       width, height, legend: { show: false }, cursor: { drag: { x: true, y: false } }, padding: [8, 6, 0, 0],
       scales: { x: { time: false }, y: {} },
-      axes: [{ ...axis, size: 24, values: (_, ages) => ages.map((age) => `${age} s`) }, { ...axis, size: 52 }],
+      axes: [{ ...axis, size: 24, values: (_, ages) => ages.map((age) => age ? `${age} s` : "0") }, { ...axis, size: 52 }],
       series: [{}, { stroke: colours.pose, paths: () => null, points: { show: true, size: 4, fill: colours.pose } },
         { stroke: colours.track, width: 2, points: { show: false }, spanGaps: true }],
       hooks: { draw: [(u) => {
