@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from buddyline.protocol.errors import BuddylineError
@@ -17,6 +18,8 @@ def needed(module: str, what: str, extra: str, package: str = "") -> Any:
         return import_module(module)
     except ImportError as error:
         package = package or module.partition(".")[0]
+        clone = Path(__file__).resolve().parents[1]
+        where = f" in {clone}" if (clone / "Makefile").is_file() and Path.cwd() != clone else ""
         raise BuddylineError(
-            f"{what} needs {package}, which is not installed ({error.name}): make install EXTRAS={extra}"
+            f"{what} needs {package}, which is not installed ({error.name}): make install EXTRAS={extra}{where}"
         ) from error
