@@ -8,7 +8,7 @@ import pytest
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.survey import normal, report
 from buddyline.tools.survey.blunders import critical_chi2
-from buddyline.tools.survey.fit import detectable
+from buddyline.tools.survey.fit import SurveyFit, chance_of, detectable
 from buddyline.tools.survey.network import adjust
 from buddyline.tools.survey.project import AdjustSettings, FixedPoint, Known, Place
 from buddyline.tools.survey.sheet import Sheet
@@ -212,6 +212,31 @@ def test_an_unchecked_leg_has_no_detectable_error_and_the_report_says_the_global
     ]
     assert np.isinf(detectable(of)[azimuths]).all()
     assert any("variance factor" in line for line in report.summary(Sheet(project, adjusted)))
+
+
+@pytest.mark.parametrize(
+    ("chi2", "freedom", "said"),
+    [
+        (0.0, 0, "no observation more than needed, so nothing is checked"),
+        (
+            8.0,
+            9,
+            "9 observations more than needed; all agree as well as their sds say (chi2 8.0, variance factor 0.89)",
+        ),
+        (
+            0.5,
+            9,
+            "9 observations more than needed; all agree better than their sds say (chi2 0.5, variance factor 0.06)",
+        ),
+        (
+            *(20.0, 1),
+            "1 observation more than needed; all contradict each other by more than their sds explain "
+            "(chi2 20.0, variance factor 20.00)",
+        ),
+    ],
+)
+def test_the_global_test_is_said_in_plain_words(chi2, freedom, said):
+    assert SurveyFit(chi2, freedom, chance_of(chi2, freedom), {}).verdict == said
 
 
 def test_gps_in_height_is_apart_from_gps_on_the_map():

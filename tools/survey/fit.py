@@ -38,11 +38,14 @@ class SurveyFit:
     def verdict(self) -> str:
         """The global test in words."""
         if not self.freedom:
-            return "so that nothing is checked"
-        words = f"variance factor {self.factor:.2f}"
+            return "no observation more than needed, so nothing is checked"
+        words = "agree as well as their sds say"
         if self.chance < FAILS:
-            return f"{words}: more than the sds explain"
-        return f"{words}: less than the sds explain" if self.chance > 1 - FAILS else words
+            words = "contradict each other by more than their sds explain"
+        elif self.chance > 1 - FAILS:
+            words = "agree better than their sds say"
+        more = "1 observation" if self.freedom == 1 else f"{self.freedom} observations"
+        return f"{more} more than needed; all {words} (chi2 {self.chi2:.1f}, variance factor {self.factor:.2f})"
 
 
 def chance_of(chi2: float, freedom: int) -> float:

@@ -57,7 +57,7 @@ def summary(sheet: Sheet) -> list[str]:
 def tests_of(adjusted: Adjusted) -> list[str]:
     """Return the global test, and what the instruments are found to be off, where the survey shows it."""
     fit = adjusted.fit
-    lines = [f"adjustment: chi2 {fit.chi2:.0f} of {fit.freedom} observations too many, {fit.verdict}"]
+    lines = [f"adjustment: {fit.verdict}"]
     for name, (value, sigma, unit) in fit.instruments.items():
         if abs(value) > SHOWN_SIGMAS * sigma:
             lines.append(f"{name}: {value:+.2f} {unit}, sd {sigma:.2f}; taken off")
