@@ -35,6 +35,8 @@ log = logging.getLogger(__name__)
 
 # This many messages are matched before the matched triggers are solved, all at once.
 TOGETHER: Final = 2048
+# Half a trigger period at 10 Hz. An offset with a larger sd (1 sd) does not tell which pictures were taken together.
+CLOCK_KNOWN_S: Final = 0.05
 # The inputs that the output has beside the poses, so that it can be evaluated and solved again without other logs.
 COPIED = ("info", "candidates", "imu", "attitude", "depth", "mark", "truth", "light_truth", "net_truth")
 
@@ -319,12 +321,15 @@ def _track_text(mode: str, pair: PairCore, tracks: Mapping[tuple[str, ...], Trac
     if pair.tracker is None or not told.rows:
         return f"  no track ({mode}): it starts from a pose, or from lights and both attitudes"
     clock = pair.tracker.clock_now()
-    clocks = (
-        f"; clock of {pair.nodes[1]} {1e3 * clock[0]:+.1f} ms from {pair.nodes[0]}'s (1 sd {1e3 * clock[1]:.1f})"
-        if clock is not None
-        else ""
-    )
+    clocks = "" if clock is None else f"; {_clock_words(pair.nodes, *clock)}"
     return (
         f"  track ({mode}): {told.rows} rows over {told.span_s:.1f} s, "
         f"longest time without a light {told.longest_gap_s:.1f} s{clocks}"
     )
+
+
+def _clock_words(nodes: tuple[str, str], offset_s: float, sigma_s: float) -> str:
+    """Return what the track says of B's clock against A's."""
+    if not sigma_s <= CLOCK_KNOWN_S:
+        return "clock offset not known"
+    return f"clock of {nodes[1]} {1e3 * offset_s:+.1f} ms from {nodes[0]}'s (1 sd {1e3 * sigma_s:.1f})"

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 import os
 import re
 import subprocess
@@ -13,6 +14,7 @@ from buddyline.protocol.divelog import DiveLogWriter
 from buddyline.solver_service.choices import METHODS
 from buddyline.solver_service.geometry.observation import Method
 from buddyline.tools.cli import COMMANDS, main
+from buddyline.tools.solve import _clock_words
 
 from tests.processes import buddyline
 from tests.solver_service.conftest import dive_messages
@@ -85,6 +87,19 @@ def test_solve_says_what_its_track_covers(capsys, dive_log, tmp_path):
     assert re.search(r"track \(smooth\): \d+ rows over \d\.\d s, longest time without a light", out)
     _, out, _ = run(capsys, "solve", dive_log, "-o", tmp_path / "none.mcap", "--track", "none")
     assert "track (" not in out
+
+
+@pytest.mark.parametrize(
+    ("sigma_s", "said"),
+    [
+        (0.0004, "clock of b -1.5 ms from a's (1 sd 0.4)"),
+        (0.2805, "clock offset not known"),
+        (math.inf, "clock offset not known"),
+        (math.nan, "clock offset not known"),
+    ],
+)
+def test_a_clock_offset_is_said_only_where_it_is_known(sigma_s, said):
+    assert _clock_words(("a", "b"), -0.0015, sigma_s) == said
 
 
 def test_solve_is_deterministic(capsys, dive_log, tmp_path):
