@@ -92,6 +92,11 @@ class Estimate:
     course: list[tuple[float, float]] = field(default_factory=list)
     last_seen: Floats | None = None
 
+    @property
+    def lights(self) -> int:
+        """Give how many lights the last trigger's pictures told."""
+        return len({(observer, light) for _, observer, light in self.trigger})
+
     def copied(self, **changes: object) -> Estimate:
         """Give an estimate that goes its own way from here."""
         lists = ("evidence_by", "trigger", "attitude_s", "told_by", "missed", "without", "turning_off", "course")

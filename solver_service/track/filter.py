@@ -341,7 +341,7 @@ class TrackFilter(TrackPool):
         while t_s - main.t_s > 1.5 * TICK_S:
             self._step(main, main.t_s + TICK_S, None)
         state, P = self._predict(main, t_s)
-        lights = np.array((len({(n, i) for _, n, i in main.trigger}),))
+        lights = np.array((main.lights,))
         return rows_of(
             (stamp_ns,),
             State.of_row(state.to_row()[None]),

@@ -60,6 +60,8 @@ HOLD_S: Final = 0.05
 TICK_S: Final = 0.1
 # Two pictures nearer than this share a step: the state is carried over so short a time by its rates.
 TOGETHER_S: Final = 0.005
+# Both nodes' pictures of one trigger are less than this apart.
+ONE_TRIGGER_S: Final = 0.03
 ATTITUDE_EVERY_S: Final = 0.5
 # A light nearer to the picture's edge need not be found: part of its spot is outside.
 EDGE_PX: Final = 2.0
@@ -270,7 +272,6 @@ class TrackSteps(TrackIntake):
         if not self._keep_s:
             return
         estimate.steps.drop_before(t_s - self._keep_s)
-        lights = sum(len(look.chosen) for look in looks)
         if together:
             last = estimate.steps.last
             estimate.steps.last = replace(
@@ -278,7 +279,7 @@ class TrackSteps(TrackIntake):
                 after=estimate.state,
                 covariance=estimate.covariance,
                 light_s=estimate.light_s,
-                lights=last.lights + lights,
+                lights=estimate.lights,
                 looks=last.looks + looks,
             )
         else:
@@ -293,7 +294,7 @@ class TrackSteps(TrackIntake):
                     walk=moved[2],
                     rates_radps=estimate.rates_radps,
                     light_s=estimate.light_s,
-                    lights=lights,
+                    lights=estimate.lights,
                     looks=looks,
                 )
             )
@@ -330,6 +331,7 @@ class TrackSteps(TrackIntake):
             y, H = self._about(estimate, sight, found.chosen, guide)
         # What another estimate chose may be behind the camera by this one.
         found = replace(found, chosen=_in_front(found.chosen, y))
+        estimate.trigger = [seen for seen in estimate.trigger if abs(sight.t_s - seen[0]) < ONE_TRIGGER_S]
         estimate.evidence += found.evidence
         estimate.evidence_by[observer] += found.evidence
         if any(inside) and not wide:
@@ -416,7 +418,6 @@ class TrackSteps(TrackIntake):
         estimate.surprise += chi2
         estimate.told += len(rows_y)
         estimate.light_s = max(estimate.light_s, sight.t_s)
-        estimate.trigger = [seen for seen in estimate.trigger if sight.t_s - seen[0] < 0.03]
         estimate.trigger += [(sight.t_s, sight.node, light) for _, light, _ in found.chosen]
 
     @staticmethod

@@ -30,7 +30,7 @@ class Step:
     """One step of a track as the smoother needs it.
 
     before: predicted; after, covariance: with what was seen at t_s. F (MOVING, SIZE), Q (MOVING, MOVING), walk: how it
-    came here from the step before. rates_radps (2, 3). lights: of how many lights its picture told, 0 where none.
+    came here from the step before. rates_radps (2, 3). lights: how many the last trigger's pictures told.
     """
 
     t_s: float

@@ -28,7 +28,7 @@ from buddyline.solver_service.track.lag import TrackLag
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.state import CLOCK
 
-from tests.solver_service.track.dives import KnownDive, Setting, filter_of, fix_errors, make, score
+from tests.solver_service.track.dives import EPOCH_NS, KnownDive, Setting, filter_of, fix_errors, make, score
 
 SHORT = Setting(seconds=12.0)
 
@@ -449,3 +449,26 @@ def test_a_live_track_of_clocks_half_a_second_apart_is_not_told(seed: int) -> No
     assert len(rows) < 0.3 * len(dive.stamps_ns)
     assert not rows or score(dive, rows).wrong == 0
     assert any("clocks are far apart" in problem or "poses contradict" in problem for problem in track.problems)
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_rows_between_two_triggers_tell_the_lights_of_the_last_one(whole: bool) -> None:
+    """Rows at 50 Hz of pictures at 5 Hz; from the fifth second to the seventh no light is in any picture."""
+    dive = make(4, replace(SHORT, rate_hz=5.0, dark_s=(5.0, 7.0), false=0))
+    first_ns = min(record.frames[0].stamp_ns for record in dive.records)
+    stamps_ns = [first_ns + k * 20_000_000 for k in range(550)]
+    if whole:
+        rows = list(smooth(dive.records, dive.fixes, stamps_ns).rows)
+    else:
+        rows = filter_of(dive.records, dive.fixes).advance(last_ns(dive.records), stamps_ns)
+    triggers: dict[int, set[int]] = {}
+    for row in rows:
+        number, since_ns = divmod(row.stamp_ns - first_ns, 200_000_000)
+        # Both pictures of a trigger are taken within some milliseconds.
+        if 20_000_000 <= since_ns <= 180_000_000:
+            triggers.setdefault(number, set()).add(row.lights)
+    assert len(triggers) > 45
+    assert all(len(told) == 1 for told in triggers.values()), triggers
+    dark = {row.lights for row in rows if 5.3 < (row.stamp_ns - EPOCH_NS) / 1e9 < 6.9}
+    assert dark == {0}
+    assert sum(told == {4} for told in triggers.values()) > len(triggers) // 4
