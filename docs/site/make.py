@@ -26,7 +26,7 @@ REPOSITORY: Final = Path(__file__).resolve().parents[2]
 PAGES: Final = {
     "Learn": ["docs/tutorial.md", "docs/install.md", "docs/dives.md", "docs/security.md", "docs/troubleshooting.md"],
     "Use from elsewhere": ["docs/library.md", "docs/bridge.md", "docs/blueos.md", "protocol/README.md"],
-    "Build and survey": ["docs/build/README.md", "node/README.md", "tools/survey/README.md"],
+    "Build and survey": ["docs/build/README.md", "node/README.md", "docs/pool_day.md", "tools/survey/README.md"],
     "Reference": ["commands", "messages", "docs/glossary.md"],
     "How it works": ["docs/theory.md", "docs/track.md", "docs/network.md", "docs/geodesy.md", "docs/decisions.md"],
     "Develop": ["CONTRIBUTING.md", "CHANGELOG.md"],
