@@ -6,7 +6,8 @@ No bus, no clock, no files, no keys: the function that checks signatures is pass
 from __future__ import annotations
 
 import hashlib
-from collections import defaultdict, deque
+from bisect import bisect_left, bisect_right
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal, NamedTuple
@@ -17,7 +18,7 @@ from buddyline.protocol.digest import end_of, is_covered, sum_of, unsealed
 from buddyline.protocol.envelope import open_envelope
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import Digest, NodeInfo, Said
-from buddyline.protocol.topics import DIGEST, IMAGE, INFO, parse_key
+from buddyline.protocol.topics import DIGEST, IMAGE, INFO, TOPICS, parse_key
 from msgspec import UNSET
 from msgspec.structs import replace
 
@@ -34,6 +35,12 @@ MOST_DIGEST_NS: Final = 3 * S_NS // 2
 MAX_NODES: Final = 256
 # Runs of a node in one log; one that ends every few seconds has hundreds in an hour.
 MAX_BOOTS: Final = 1024
+# Times of a node that its digests cover, each without a gap. What is forgotten is nobody's word, and no forgery.
+MAX_COVERED: Final = 1024
+# What a node says was measured at most this long before.
+SAID_NS: Final = S_NS
+# These are said again when the bus connects, however old.
+SAID_AGAIN: Final = {end_of(topic) for topic in TOPICS if topic.latest_only and is_covered(topic)}
 # Digests of a node that may come late: a day's.
 MAX_ABSENT: Final = 86_400
 
@@ -91,27 +98,26 @@ class Checked:
     newest: dict[str, Digest] = field(default_factory=dict)
     # By boot: the numbers of the digests that are missing before that.
     absent: dict[str, set[int]] = field(default_factory=lambda: defaultdict(set))
-    # Where digests were missing when the next one came, by the node's clock: begin and end.
-    gaps: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=MAX_BOOTS))
+    # Of what the node said then, by its clock, a digest is there: begins and ends, apart and in order.
+    covered: list[tuple[int, int]] = field(default_factory=list)
     due: list[_Due] = field(default_factory=list)
     # By topic: the checksum of the newest stretch that was right.
     right: dict[str, str] = field(default_factory=dict)
-    # Where the first digest begins, if the log begins amid the node's run; else 0.
-    begins_ns: int = 0
 
 
 class DigestCheck:
     """Compares messages, in the order in which they were written, with their nodes' digests.
 
     refuses: checks signatures; None: they are not looked at. must_sign: digests without a signature are named, too.
-    in_order: digests come in the order in which they were written, or are named.
+    own: it is a node's own log, of one run: digests come in the order in which they were written, or are named, and
+    what none of them has is forged, however it is stamped. A recording may have messages of runs without a digest.
     """
 
-    def __init__(self, refuses: Refuses | None = None, *, must_sign: bool = False, in_order: bool = True) -> None:
+    def __init__(self, refuses: Refuses | None = None, *, must_sign: bool = False, own: bool = True) -> None:
         self.nodes: dict[str, Checked] = {}
         self._refuses = refuses
         self._must_sign = must_sign
-        self._in_order = in_order
+        self._own = own
         self._lists = 0
 
     def add(self, key: str, payload: bytes, time_ns: int) -> Iterator[Discrepancy]:
@@ -127,7 +133,7 @@ class DigestCheck:
             try:
                 due = _Due(time_ns, *unsealed(key, payload))
                 absent = of.absent.get(due.digest.boot, ())
-                if _insert(of.due, due) and self._in_order and due.digest.seq not in absent:
+                if _insert(of.due, due) and self._own and due.digest.seq not in absent:
                     yield Discrepancy(node, "altered", time_ns - S_NS, time_ns, "digests in another order")
             except MessageError as error:
                 words = f"a digest cannot be read: {error}"
@@ -141,7 +147,7 @@ class DigestCheck:
             waiting = of.waiting[name]
             waiting.append(one)
             if len(waiting) > min(MAX_WAITING, MAX_WAITING_TOGETHER // self._lists):
-                yield from _leftover(node, of, name, [waiting.pop(0)])
+                yield from self._leftover(node, of, name, [waiting.pop(0)])
         while of.due and (of.due[0].time_ns + LATE_NS < time_ns or len(of.due) > MAX_DUE):
             yield from self._judge(node, of, of.due.pop(0))
 
@@ -152,7 +158,7 @@ class DigestCheck:
                 yield from self._judge(node, of, due)
             of.due.clear()
             for topic, waiting in of.waiting.items():
-                yield from _leftover(node, of, topic, waiting)
+                yield from self._leftover(node, of, topic, waiting)
             of.waiting.clear()
             for boot, digest in of.newest.items():
                 if digest.last is UNSET:
@@ -173,6 +179,8 @@ class DigestCheck:
         if newest is None and len(of.newest) >= MAX_BOOTS:
             yield Discrepancy(node, "altered", *second, f"digests of more than {MAX_BOOTS} runs of the node")
             return
+        if self._own and newest is None and of.newest:
+            yield Discrepancy(node, "altered", *second, "a digest of another run of the node")
         absent = of.absent[digest.boot]
         if newest is not None and digest.seq <= newest.seq and digest.seq not in absent:
             yield Discrepancy(node, "altered", *second, "a digest comes again, or late")
@@ -184,7 +192,6 @@ class DigestCheck:
                 words = "the end of the node's run before is missing"
                 yield Discrepancy(node, "missing", before.stamp_ns, digest.since_ns, words, before.boot)
         if newest is None and digest.seq:
-            of.begins_ns = of.begins_ns if of.newest else digest.since_ns
             words = f"nothing is there of the node's first {digest.seq} s"
             began_ns = max(digest.since_ns - digest.seq * MOST_DIGEST_NS, 0)
             yield Discrepancy(node, "missing", began_ns, digest.since_ns, words, digest.boot)
@@ -192,10 +199,11 @@ class DigestCheck:
         elif newest is not None and digest.seq > newest.seq + 1:
             words = f"{digest.seq - newest.seq - 1} digests are missing"
             yield Discrepancy(node, "missing", newest.stamp_ns, digest.since_ns, words, digest.boot)
-            of.gaps.append((newest.stamp_ns, digest.since_ns))
             _expect_late(of, digest, newest.seq + 1)
         absent.discard(digest.seq)
-        of.begins_ns = min(of.begins_ns, digest.since_ns)
+        # Where the clock was set ahead, the time between was none. After its last digest a node says nothing.
+        begin_ns = max(digest.since_ns, digest.stamp_ns - LATE_NS)
+        _cover(of.covered, begin_ns, digest.stamp_ns + (0 if digest.last is UNSET else SAID_NS))
         if newest is None or digest.seq > newest.seq:
             of.newest[digest.boot] = replace(digest, said=[])
         found = [one for stretch in digest.said for one in _compare(node, of, digest, stretch)]
@@ -203,6 +211,26 @@ class DigestCheck:
         if not found:
             of.seconds += 1
             of.signed += bool(signature and self._refuses is not None)
+
+    def _leftover(self, node: str, of: Checked, topic: str, left: list[Undigested]) -> Iterator[Discrepancy]:
+        """Name the messages that no digest has named, by second."""
+        if not of.newest:
+            return  # the whole node is not signed
+        # What a run said after the last digest that is there, also where the clock was set back before the next run.
+        ends_ns = [digest.stamp_ns for digest in of.newest.values() if digest.last is UNSET]
+        # All digests are there, and no other run is.
+        is_whole = self._own and not ends_ns and not any(of.absent.values())
+        seconds: dict[tuple[int, Kind], int] = defaultdict(int)
+        for one in left:
+            # A forgery is only what would have to be in a digest that is there.
+            altered = _in_digests(of, one.stamp_ns, one.stamp_ns + SAID_NS)
+            if topic in SAID_AGAIN:
+                altered = altered and _in_digests(of, max(one.stamp_ns, one.time_ns - SAID_NS), one.time_ns)
+            altered = altered and not any(-SAID_NS <= one.stamp_ns - end_ns <= MOST_DIGEST_NS for end_ns in ends_ns)
+            seconds[one.time_ns // S_NS, "altered" if altered or is_whole else "unsigned"] += 1
+        for (second, kind), count in sorted(seconds.items()):
+            at_ns = second * S_NS
+            yield Discrepancy(node, kind, at_ns, at_ns + S_NS, f"{topic}: {count} that are in no digest")
 
     def _why_refused(self, node: str, of: Checked, signature: str, signed: bytes) -> str:
         if not signature or self._refuses is None:
@@ -221,6 +249,23 @@ def _expect_late(of: Checked, digest: Digest, first: int) -> None:
     """Note the digests from number `first` up to this one as absent; the newest ones, if they are too many."""
     room = MAX_ABSENT - sum(map(len, of.absent.values()))
     of.absent[digest.boot].update(range(max(first, digest.seq - room), digest.seq))
+
+
+def _cover(covered: list[tuple[int, int]], begin_ns: int, end_ns: int) -> None:
+    """Add a time, joined with those that it touches; nothing where the clock was set back meanwhile."""
+    if begin_ns > end_ns:
+        return
+    first = bisect_left(covered, begin_ns, key=lambda one: one[1])
+    after = bisect_right(covered, end_ns, key=lambda one: one[0])
+    if first < after:
+        begin_ns, end_ns = min(begin_ns, covered[first][0]), max(end_ns, covered[after - 1][1])
+    covered[first:after] = [(begin_ns, end_ns)]
+    del covered[:-MAX_COVERED]
+
+
+def _in_digests(of: Checked, begin_ns: int, end_ns: int) -> bool:
+    at = bisect_right(of.covered, begin_ns, key=lambda one: one[0]) - 1
+    return at >= 0 and end_ns <= of.covered[at][1]
 
 
 def _insert(due: list[_Due], new: _Due) -> bool:
@@ -279,22 +324,3 @@ def _compare(node: str, of: Checked, digest: Digest, stretch: Said) -> Iterator[
 def _remove(waiting: list[Undigested], gone: list[Undigested]) -> None:
     known = set(map(id, gone))
     waiting[:] = [one for one in waiting if id(one) not in known]
-
-
-def _leftover(node: str, of: Checked, topic: str, left: list[Undigested]) -> Iterator[Discrepancy]:
-    """Name the messages that no digest has named, by second."""
-    if not of.newest:
-        return  # the whole node is not signed
-    ended = all(digest.last is not UNSET for digest in of.newest.values())
-    # What is sent after the last digest was measured at most a second before.
-    ends_ns = max(digest.stamp_ns for digest in of.newest.values()) - S_NS
-    # Those of a digest that never came are nobody's word, and no forgery for that.
-    gaps = of.gaps if any(of.absent.values()) else ()
-    seconds: dict[tuple[int, Kind], int] = defaultdict(int)
-    for one in left:
-        outside = one.stamp_ns < of.begins_ns or (one.stamp_ns >= ends_ns and not ended)
-        outside = outside or any(begin_ns - S_NS <= one.stamp_ns < end_ns for begin_ns, end_ns in gaps)
-        seconds[one.time_ns // S_NS, "unsigned" if outside else "altered"] += 1
-    for (second, kind), count in sorted(seconds.items()):
-        at_ns = second * S_NS
-        yield Discrepancy(node, kind, at_ns, at_ns + S_NS, f"{topic}: {count} that are in no digest")

@@ -26,20 +26,20 @@ AUTHENTICITY: Final = "authenticity"
 _WORDS: Final = {
     "altered": "is not what the node wrote",
     "missing": "is not complete, and the rest of these seconds is not verified",
-    "unsigned": "has something that nobody vouches for",
+    "unsigned": "has something that nobody vouches for, which is no sign of forgery",
 }
 
 
-def digest_check(authority: Path | str | None, *, in_order: bool = True) -> DigestCheck:
+def digest_check(authority: Path | str | None, *, own: bool = True) -> DigestCheck:
     """Return a check that accepts the authority's nodes; without the package cryptography, one of the sums alone."""
     try:
         from buddyline.protocol.signing import Trust
     except ImportError:
         if authority is not None:
             log.warning("signatures are not checked: the package cryptography is missing (`make install EXTRAS=keys`)")
-        return DigestCheck(in_order=in_order)
+        return DigestCheck(own=own)
     refuses: Refuses = Trust(authority).refuses
-    return DigestCheck(refuses, must_sign=authority is not None, in_order=in_order)
+    return DigestCheck(refuses, must_sign=authority is not None, own=own)
 
 
 def check_logs(readers: Sequence[DiveLogReader], authority: str | None) -> list[str]:
@@ -60,7 +60,7 @@ def check_logs(readers: Sequence[DiveLogReader], authority: str | None) -> list[
         # at its end what came late.
         own = "boot" in reader.metadata()
         # Before anything is said of signatures: it refuses an authority that is no certificate.
-        check = digest_check(authority, in_order=own)
+        check = digest_check(authority, own=own)
         if authority is not None:
             unsigned = [f"{reader.path}: node {node}: is not signed" for node in nodes if node not in signed]
             losses.report(unsigned)

@@ -88,7 +88,7 @@ class Recording:
         self.dropped = 0
         self.filler: Filler | None = None
         self._recorder = recorder
-        self._check = digest_check(authority)
+        self._check = digest_check(authority, own=False)
         self._found: list[Discrepancy] = []
         self._lock = threading.Lock()
 

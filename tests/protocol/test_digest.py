@@ -64,9 +64,9 @@ def written(
     return lines
 
 
-def findings(lines: list[Line], keys: Path | None) -> list[Discrepancy]:
+def findings(lines: list[Line], keys: Path | None, *, own: bool = True) -> list[Discrepancy]:
     trust = Trust(keys / "ca.crt") if keys is not None else None
-    check = DigestCheck(None if trust is None else trust.refuses, must_sign=trust is not None)
+    check = DigestCheck(None if trust is None else trust.refuses, must_sign=trust is not None, own=own)
     return [*(one for line in lines for one in check.add(*line)), *check.finish()]
 
 
@@ -238,6 +238,83 @@ def test_messages_whose_digest_never_came_are_nobodys_word_and_no_forgery(keys: 
     assert [one.kind for one in findings([*without[:5], (key, forged, at_ns), *without[5:]], keys)].count(
         "altered"
     ) == 1
+
+
+def kinds(found: list[Discrepancy]) -> set[str]:
+    return {one.kind for one in found}
+
+
+def forged_at(at_ns: int) -> Line:
+    return "buddyline/node/a/depth", encode(said("a", at_ns, 99.0)[0]), at_ns
+
+
+def test_what_a_killed_run_said_last_is_no_forgery_once_the_next_run_signs(keys: Path) -> None:
+    killed = written("a", keys, ended=False)[:-3]
+    again = written("a", keys, "y", BEGAN_NS + 9 * S_NS)
+    assert kinds(findings([*killed, *again], keys, own=False)) == {"missing", "unsigned"}
+    # What neither run has said is named as before.
+    for at_ns in (BEGAN_NS + 3 * S_NS + 5, BEGAN_NS + 12 * S_NS + 5):
+        altered_ones = [
+            one for one in findings([*killed, *again, forged_at(at_ns)], keys, own=False) if one.kind == "altered"
+        ]
+        assert [one.words for one in altered_ones] == ["depth: 1 that are in no digest"]
+
+
+def test_a_run_of_which_no_digest_is_there_is_no_forgery_once_the_next_run_signs(keys: Path) -> None:
+    """A recording that begins just before a node is killed has its caches' messages, and no digest after them."""
+    before = [line for line in written("a", keys, ended=False) if not line[0].endswith("/digest")]
+    again = written("a", keys, "y", BEGAN_NS + 9 * S_NS)
+    assert kinds(findings([*before, *again], keys, own=False)) == {"unsigned"}
+
+
+def test_a_run_that_began_just_before_a_recording_ended_is_no_forgery(keys: Path) -> None:
+    begun = written("a", keys, "y", BEGAN_NS + 9 * S_NS)[:5]
+    assert kinds(findings([*written("a", keys), *begun], keys, own=False)) == {"unsigned"}
+
+
+def test_a_clock_that_is_set_back_while_a_node_is_down_makes_no_forgery(keys: Path) -> None:
+    killed = written("a", keys, ended=False)[:-5]
+    again = written("a", keys, "y", BEGAN_NS - 3 * S_NS // 2)
+    lines = [*killed, *((key, payload, at_ns + 9 * S_NS) for key, payload, at_ns in again)]
+    assert "altered" not in kinds(findings(lines, keys, own=False))
+
+
+def test_in_a_nodes_own_whole_log_all_that_is_in_no_digest_is_a_forgery(keys: Path) -> None:
+    lines = written("a", keys)
+    for at_ns in (BEGAN_NS - 1000 * S_NS, BEGAN_NS + 3 * S_NS + 5, BEGAN_NS + 1000 * S_NS):
+        assert [one.kind for one in findings([*lines[:20], forged_at(at_ns), *lines[20:]], keys)] == ["altered"]
+    spliced = [*lines[:46], *written("a", keys, "y", BEGAN_NS + 1000 * S_NS)[46:]]
+    assert "a digest of another run of the node" in {one.words for one in findings(spliced, keys)}
+
+
+@pytest.mark.parametrize(("again_s", "kind"), [(0.0, "altered"), (8.0, "unsigned")])
+def test_a_calibration_that_is_said_again_for_a_new_hub_may_lack_its_digest(
+    keys: Path, again_s: float, kind: str
+) -> None:
+    lines = written("a", keys, ended=False)
+    again = (*lines[0][:2], BEGAN_NS + round(again_s * S_NS) + S_NS // 2)
+    found = findings(sorted([*lines, again], key=lambda line: line[2]), keys, own=False)
+    assert [one.kind for one in found if one.words == "info: 1 that are in no digest"] == [kind]
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_no_kill_and_no_loss_of_digests_is_called_a_forgery(keys: Path, seed: int) -> None:
+    """Runs that are killed anywhere, digests that never come, a recording that begins and ends anywhere."""
+    rng = random.Random(seed)
+    lines: list[Line] = []
+    began_ns = BEGAN_NS
+    for run in range(4):
+        of_run = written("a", keys, f"run{run}", began_ns, ended=rng.random() < 0.3)
+        began_ns += rng.choice((7, 9)) * S_NS
+        if "last" not in of_run[-1][1].decode():
+            of_run = of_run[: rng.randrange(2, len(of_run))]
+        lines += of_run
+    rare = rng.choice((0.0, 0.1, 0.5))
+    lines = [line for line in lines if not (line[0].endswith("/digest") and rng.random() < rare)]
+    infos = [line for line in lines if line[0].endswith("/info")]
+    kept = lines[rng.randrange(len(lines) // 2) : rng.randrange(len(lines) // 2, len(lines))]
+    found = findings([*infos[:1], *(line for line in kept if line not in infos[:1])], keys, own=False)
+    assert "altered" not in kinds(found), found
 
 
 def test_a_flood_fills_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
