@@ -203,8 +203,8 @@ def test_seconds_of_darkness(dark_s: float, worst_m: float) -> None:
 def test_a_second_pass_that_diverges_is_no_track(monkeypatch: pytest.MonkeyPatch) -> None:
     short = make(4, replace(SHORT, seconds=6.0))
 
-    def diverging(track: TrackFilter, records: Records, fixes: Sequence[FixSeen]) -> None:
-        pass_over(track, records, fixes)
+    def diverging(track: TrackFilter, records: Records, fixes: Sequence[FixSeen], **limits_ns: int) -> None:
+        pass_over(track, records, fixes, **limits_ns)
         if not track.restarts and track.main is not None:
             track.main.state = replace(track.main.state, clock_s=-0.7)
 
