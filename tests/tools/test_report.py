@@ -11,6 +11,7 @@ import pytest
 from buddyline.protocol.messages import Message, SolverStatus
 from buddyline.tools.cli import main
 from buddyline.tools.dives import Dive
+from buddyline.tools.monitor.summary import summarize
 from msgspec import UNSET
 from msgspec.structs import replace
 
@@ -83,6 +84,14 @@ def test_every_number_follows_from_the_log_by_an_independent_script(dive: tuple[
     report = tmp_path / "report.html"
     report.write_text(page.replace('"range_most_m": ', '"range_most_m": 1'))
     assert recompute_report.main(log, str(report)) == 1
+
+
+def test_a_message_that_several_recordings_have_counts_once(tmp_path: Path) -> None:
+    messages = [attitude("a", at(k)) for k in range(40)]
+    first = write_log(tmp_path / "first.mcap", *messages[:30])
+    second = write_log(tmp_path / "second.mcap", *messages[10:])
+    with Dive([first, second]) as dive:
+        assert summarize(dive, None).counts == {"buddyline/node/a/attitude": 40}
 
 
 def test_it_finds_a_number_that_differs() -> None:

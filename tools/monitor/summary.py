@@ -47,7 +47,8 @@ class Summary:
     points: its poses, tracks: its track; of each only some, spacing_ns apart at least. dark_s: the longest time in
     which the track used no light. track_coverage: where the track covers the dive, None without a track.
     depths: by node, (ns, m). depth_sigma_m: by node, the gauge's stated one. path: all places of the track.
-    infos: by node, one for each calibration that it had. counts: messages by key.
+    infos: by node, one for each calibration that it had. counts: messages by key, each once,
+    of however many logs.
     """
 
     picture: PairPicture
@@ -92,9 +93,14 @@ def summarize(dive: Dive, pair: Pair | None) -> Summary:
     spacing_ns = max(MIN_SPACING_NS, (dive.end_ns - dive.start_ns) // MAX_POINTS)
     summary = Summary(PairPicture(pair), Coverage(dive.start_ns, dive.end_ns), spacing_ns)
     lit_before_ns: int | None = None
+    counted: set[int] = set()
     for envelope in dive.messages(*TOPICS):
         message, at_ns = envelope.message, envelope.time_ns
-        summary.counts[envelope.key] += 1
+        # A message is in each recording that was running, and in the node's own log.
+        identity = hash((envelope.key, envelope.payload))
+        if identity not in counted:
+            counted.add(identity)
+            summary.counts[envelope.key] += 1
         if isinstance(message, Truth):
             if pair in (envelope.ids, envelope.ids[::-1]):
                 summary.truths.append(message if envelope.ids == pair else inverted(message))
