@@ -198,35 +198,37 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
     learned = parts[-1]
     shift_s = learned.state.clock_s if learned.covariance[CLOCK, CLOCK] < KNOWN_CLOCK_S**2 else 0.0
     clock_sigma_s = CLOCK_LEFT_S + 3.0 * math.sqrt(learned.covariance[CLOCK, CLOCK])
-    second = _empty_filter(records, clock_ns + round(shift_s * 1e9), clock_sigma_s)
-    second.restarts = False
     shares = reduce(Shares.plus, [part.shares for part in parts]).best()
-    second.take_off(shares)
     walking = joint([part.walking for part in parts])
     told = sum(part.told for part in parts)
-    if told > 100:
-        second.unrest = min(max(math.sqrt(sum(part.surprise for part in parts) / told), 0.3), 2.0)
-    since_s = -math.inf
-    for part in parts:
-        path = smoothed(part.steps)
-        guide_by(second, path)
-        earlier = _path_before(records, clock_ns, path, since_s, shares)
-        if earlier is not None:
-            guide_by(second, earlier)
-            path = earlier
-        state = replace(path.state(0), clock_s=0.0)
-        shaking = part.shaking.less(shares)
-        begun = broad_start(second.nodes, state, clock_sigma_s, path.oldest, shaking)
-        second.begin(float(path.t_s[0]) - 0.01, part.end_s, *begun, shaking, walking)
-        since_s = part.end_s
+    unrest = min(max(math.sqrt(sum(part.surprise for part in parts) / told), 0.3), 2.0) if told > 100 else None
+    paths = [(smoothed(part.steps), part.end_s, part.shaking.less(shares)) for part in parts]
     # Every step of the first pass holds a covariance: both passes at once take twice the memory.
-    del first, parts, part, learned, path, earlier
-    pass_over(second, records, ())
-    found = parts_of(second)
-    if any(clock_off_by(one, MOST_LEFT_S) for one in found):
-        said = f"{second.both}: the second pass contradicts the first on the clocks, so it has diverged: no track"
-        return Smoothed([], clock_ns * 1e-9, math.inf, [*second.problems, said])
-    return _smoothed(second, found, outputs_ns)
+    del first, parts, learned
+    # Where the dive's beginning, before the first start, leads the second pass astray, it is left out.
+    for to_beginning in (True, False):
+        second = _empty_filter(records, clock_ns + round(shift_s * 1e9), clock_sigma_s)
+        second.restarts = False
+        second.take_off(shares)
+        if unrest is not None:
+            second.unrest = unrest
+        since_s = -math.inf
+        for path, end_s, shaking in paths:
+            guide_by(second, path)
+            earlier = _path_before(records, clock_ns, path, since_s, shares) if to_beginning else None
+            if earlier is not None:
+                guide_by(second, earlier)
+            whole = earlier or path
+            state = replace(whole.state(0), clock_s=0.0)
+            begun = broad_start(second.nodes, state, clock_sigma_s, whole.oldest, shaking)
+            second.begin(float(whole.t_s[0]) - 0.01, end_s, *begun, shaking, walking)
+            since_s = end_s
+        pass_over(second, records, ())
+        found = parts_of(second)
+        if not any(clock_off_by(one, MOST_LEFT_S) for one in found):
+            return _smoothed(second, found, outputs_ns)
+    said = f"{second.both}: the second pass contradicts the first on the clocks, so it has diverged: no track"
+    return Smoothed([], clock_ns * 1e-9, math.inf, [*second.problems, said])
 
 
 def _path_before(records: Records, clock_ns: int, path: Path, since_s: float, shares: Floats) -> Path | None:

@@ -327,7 +327,7 @@ class TrackSteps(TrackIntake):
             found = associate(y, H, estimate.covariance[BLOCK], sight.sigma_px, detection, clutter)
         else:
             found = associate(*self._without(guide, sight), sight.sigma_px, detection, clutter)
-        if wide and found.chosen:
+        if wide and found.chosen and estimate.confirmed:
             y, H = self._about(estimate, sight, found.chosen, guide)
         # What another estimate chose may be behind the camera by this one.
         found = replace(found, chosen=_in_front(found.chosen, y))

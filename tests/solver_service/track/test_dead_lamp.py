@@ -86,6 +86,16 @@ def test_a_track_that_is_replaced_and_that_no_fix_agreed_with_leaves_no_rows() -
 
 
 @pytest.mark.slow
+def test_a_second_pass_that_the_dive_s_beginning_leads_astray_begins_with_the_first_pass() -> None:
+    """The first start is 11 s late, and what is carried back from it is off by half the range: there was no row."""
+    wrong, share = simulated(
+        Scenario(ENVIRONMENTS[1], seed=2011, start_ns=EPOCH_NS, inertial="poor", dead_lamps=("a.right",)), 40.0
+    )
+    assert wrong == 0
+    assert share > 0.6
+
+
+@pytest.mark.slow
 def test_twenty_dives_with_a_dark_lamp() -> None:
     judged = []
     for seed in range(20):
