@@ -166,9 +166,9 @@ class NetTracker:
             and not self._filter.main.places
             and any(known[n][0].fixed is not UNSET for n in new)
         ):
-            # From now on a fixed node holds the frame.
+            # From the next outcome on a fixed node holds the frame.
             self.forget()
-            new = sorted(known)
+            return
         for node in new:
             info, rig = known[node]
             if self._filter is None:

@@ -10,6 +10,7 @@ import pytest
 from buddyline.node.sim import dive as simulation
 from buddyline.node.sim.scenario import DivePlan, Scenario
 from buddyline.node.sim.world import World
+from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Candidates, FixedPlace, LightTruth, Message, NodeInfo, NodePose, Truth
 from buddyline.solver_service.config import SolveConfig, track_settings
 from buddyline.solver_service.core import SolverCore
@@ -106,6 +107,22 @@ def test_without_a_fixed_node_the_frame_moves_with_one() -> None:
     assert sorted(found) == ["a", "b", "c", "d"]
     # Only the compasses say where north is.
     assert all(rows[:, 0].max() < 1.0 and rows[:, 2].mean() < 2.0 for rows in found.values())
+
+
+def test_a_fixed_node_that_comes_after_the_others_holds_the_frame(
+    four: tuple[World, list[Message], list[NodePose]],
+) -> None:
+    """Its calibration may be heard when the network of the others has begun."""
+    world, messages, _ = four
+    late_ns = messages[0].stamp_ns + 3 * S_NS
+    late = [one for one in messages if isinstance(one, NodeInfo) and one.node == "a" and one.stamp_ns < late_ns]
+    rest = [one for one in messages if one not in late]
+    at = next(i for i, one in enumerate(rest) if one.stamp_ns > late_ns)
+    poses, _ = solved([*rest[:at], *late, *rest[at:]], together=50)
+    after = [one for one in poses if one.stamp_ns > late_ns + S_NS]
+    assert {one.node for one in after} == {"a", "b", "c", "d"}
+    assert {one.fixed for one in after if one.node == "a"} == {True}
+    assert all(np.median(rows[:, 0]) < 0.05 for rows in errors(world, after).values())
 
 
 def test_two_nodes_make_no_network_unless_one_is_fixed() -> None:
