@@ -41,7 +41,7 @@ NodeMessage: TypeAlias = NodeInfo | Candidates | Attitude | Depth | Imu | ImuMea
 
 # If the receive time goes back by more than this, the receiver's clock was set back.
 SET_BACK_NS: Final = 1 * S_NS
-# As much time is taken to have passed meanwhile: the service tells the time as often.
+# Counted as passed when the clock is set back: the service tells the time at least as often.
 UNSEEN_NS: Final = 250 * MS_NS
 # Limits memory: a sender that invents node ids must not get a stream for each.
 MAX_NODES: Final = 16
