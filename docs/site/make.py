@@ -28,7 +28,9 @@ PAGES: Final = {
     "Use from elsewhere": ["docs/library.md", "docs/bridge.md", "docs/blueos.md", "protocol/README.md"],
     "Build and survey": ["docs/build/README.md", "node/README.md", "docs/pool_day.md", "tools/survey/README.md"],
     "Reference": ["commands", "messages", "docs/glossary.md"],
-    "How it works": ["docs/theory.md", "docs/track.md", "docs/network.md", "docs/geodesy.md", "docs/decisions.md"],
+    "How it works": [
+        "docs/theory.md", "docs/node.md", "docs/track.md", "docs/network.md", "docs/geodesy.md", "docs/decisions.md",
+    ],  # fmt: skip
     "Develop": ["CONTRIBUTING.md", "CHANGELOG.md"],
 }
 LINK: Final = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s#]+)(#[^)\s]*)?\)")
