@@ -179,6 +179,23 @@ def test_a_sparse_inverse_is_the_dense_one(monkeypatch):
     assert dense.solution.redundancies.sum() == pytest.approx(dense.solution.freedom, rel=1e-6)
 
 
+@pytest.mark.parametrize(("legs", "of_a_dive"), [(1500, 300), (900, 20)])
+def test_an_inverse_stays_sparse_over_long_lines_and_many_dives(legs, of_a_dive):
+    pytest.importorskip("scipy")
+    rng = np.random.default_rng(1)
+    read = world.readings_of(world.line(rng, legs), rng)
+    adjusted = adjust(world.project_of([replace(leg, dive=1 + k // of_a_dive) for k, leg in enumerate(read)]))
+    solved = adjusted.solution.normal
+    # Of neighbours and of a dive's own instruments, not of other dives'.
+    assert np.mean([len(below) for below in solved._tree.below]) < 40
+    for name in ("1", str(legs // 2), str(legs)):
+        number = adjusted.solution.observations.at[name]
+        unit = np.zeros((len(adjusted.solution.x), 3))
+        unit[3 * number : 3 * number + 3] = np.eye(3)
+        expected = solved.solve(unit)[3 * number : 3 * number + 3]
+        np.testing.assert_allclose(adjusted.positions[name].covariance, expected, rtol=1e-6, atol=1e-12)
+
+
 def test_a_network_of_distances_alone_keeps_its_shape():
     rng = np.random.default_rng(2)
     datums_m = np.column_stack([rng.uniform(0, 12, (6, 2)), rng.uniform(8, 10, 6)])
@@ -267,4 +284,4 @@ def test_a_known_line_that_says_nothing_is_refused(known, said):
 
 def test_what_nothing_determines_is_a_known_error():
     with pytest.raises(BuddylineError, match="nothing observes"):
-        normal.Normal((np.array([0]), np.array([0])), np.array([1.0]), np.array([1.0]), np.array([0, -1]))
+        normal.Normal((np.array([0]), np.array([0])), np.array([1.0]), np.array([1.0]), np.array([0, 1]))

@@ -169,7 +169,7 @@ def depths_alone(readings: Sequence[DepthReading], tides: Sequence[int]) -> Obse
     of = Observations([])
     gauges = _GaugeTerms(of, readings, tides)
     for one in readings:
-        terms = [(of.unknown(one.station, early=True), 1.0), *gauges.terms(one, 1.0)]
+        terms = [(of.unknown(one.station), 1.0), *gauges.terms(one, 1.0)]
         of.rows[one.key] = of.add("number", -1, -1, one.depth_m, one.noise_m, terms, leg=one.leg, what=one.what)
     return of
 
@@ -338,7 +338,7 @@ class _Compasses:
         """Add the unknown azimuth of a leg's line from camera to camera; return its column."""
         leg = to.legs[number]
         guess = _guess(leg, to.turns_rad[number])
-        column = self._of.unknown(f"sight {number}", None, guess, early=True)
+        column = self._of.unknown(f"sight {number}", None, guess)
         run_m = max(leg.distance_m, 0.3)
         held = math.sqrt(2) * max(self._project.settings.centering_m, 1e-3) / run_m
         self._of.add("azimuth", start, end, 0.0, held, [(column, -1.0)], leg=number, what="centering")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Final
 
 import numpy as np
@@ -11,13 +12,17 @@ from buddyline.tools.survey.averages import Floats, Ints
 # Up to this many unknowns a dense inverse is as fast, and needs no scipy.
 DENSE: Final = 1500
 SYMMETRIC: Final[dict[str, Any]] = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+# A block in more rows than this many times the root of the number of blocks is eliminated last (the rule of AMD).
+OFTEN: Final = 10.0
+# Subtrees of up to this many unknowns are one front.
+WIDE: Final = 48
 
 
 class Normal:
     """N = A^T W A of rows A (m, n) as coordinates (row, column, value) and their weights (m,); positive definite.
 
-    blocks: (n,), unknowns of one number are eliminated together; -1: last, for those that stand in very many rows.
-    before: equations of the same pattern; their order of elimination is used again.
+    blocks: (n,), from 0 without gaps: unknowns of one number are eliminated together. before: equations of the same
+    pattern; their order of elimination is used again.
     Raises BuddylineError if an unknown is not determined.
     """
 
@@ -34,7 +39,7 @@ class Normal:
         self._scale = 1 / np.sqrt(square)
         scaled = values * np.sqrt(weights[rows]) * self._scale[columns]
         self._lu: Any = None
-        self._order: Ints = np.empty(0, dtype=np.int64) if before is None else before._order
+        self._tree: _Tree | None = None if before is None else before._tree
         try:
             if count <= DENSE:
                 A = np.zeros((len(weights), count))
@@ -51,23 +56,19 @@ class Normal:
             from scipy.sparse.linalg import splu
         except ModuleNotFoundError as error:
             raise BuddylineError("a survey of this size needs scipy: make install EXTRAS=survey") from error
-        count = int(rows.max()) + 1
-        if not len(self._order):
-            rank = _elimination(rows, blocks[columns], count)
-            self._order = np.argsort(np.where(blocks >= 0, rank[blocks], len(rank)), kind="stable")
-        place = np.empty(self.count, dtype=np.int64)
-        place[self._order] = np.arange(self.count)
-        A = csc_array((scaled, (rows, place[columns])), shape=(count, self.count))
-        self._N, self._place = (A.T @ A).tocsc(), place
-        self._lu = splu(self._N, permc_spec="NATURAL", **SYMMETRIC)
+        if self._tree is None:
+            self._tree = _Tree(rows, columns, blocks)
+        A = csc_array((scaled, (rows, self._tree.place[columns])), shape=(int(rows.max()) + 1, self.count))
+        self._lu = splu((A.T @ A).tocsc(), permc_spec="NATURAL", **SYMMETRIC)
 
     def solve(self, right: Floats) -> Floats:
         """Return N^-1 times right, (n,) or (n, k)."""
         scale = self._scale if right.ndim == 1 else self._scale[:, None]
         scaled = scale * right
-        if self._lu is None:
+        if self._tree is None:
             return np.asarray(scale * np.linalg.solve(self._dense, scaled))
-        return np.asarray(scale * self._lu.solve(np.ascontiguousarray(scaled[self._order]))[self._place])
+        tree = self._tree
+        return np.asarray(scale * self._lu.solve(np.ascontiguousarray(scaled[tree.order]))[tree.place])
 
     def blocks(self, groups: Ints, columns: Ints, values: Floats) -> tuple[Floats, Floats]:
         """Return the inverse between the unknowns of each group, (g, k, k), and v^T N^-1 v of each row v, (m,).
@@ -78,61 +79,35 @@ class Normal:
         at = [np.where(one >= 0, one, 0) for one in (groups, columns)]
         scales = [np.where(one >= 0, self._scale[here], 0.0) for one, here in zip((groups, columns), at, strict=True)]
         scaled = values * scales[1]
-        if self._lu is None:
+        if self._tree is None:
             inverse = np.linalg.inv(self._dense)
             found = inverse[at[0][:, :, None], at[0][:, None, :]]
             forms = np.einsum("mi,mij,mj->m", scaled, inverse[at[1][:, :, None], at[1][:, None, :]], scaled)
         else:
-            found, forms = self._selected(groups, columns, scaled)
+            found, forms = self._selected(self._tree, groups, columns, scaled)
         return np.asarray(found * scales[0][:, :, None] * scales[0][:, None, :]), np.asarray(forms)
 
-    def _lower(self) -> tuple[Ints, Ints, Floats]:
-        """Return L's columns' starts, its rows in order and their values, with the zeros that happen to be exact.
-
-        Those are left out of a factor, but not of one in which nothing can cancel.
-        """
-        from scipy.sparse.linalg import splu
-
-        pattern = self._N.copy()
-        pattern.data[:] = -1.0
-        pattern.setdiag(2.0 * np.diff(pattern.indptr))
-        whole = splu(pattern, permc_spec="NATURAL", **SYMMETRIC).L.tocsc()
-        whole.sort_indices()
-        lower = self._lu.L.tocsc()
-        lower.sort_indices()
-
-        def keys(one: Any) -> Ints:
-            columns = np.repeat(np.arange(self.count, dtype=np.int64), np.diff(one.indptr))
-            return np.asarray(columns * self.count + one.indices)
-
-        values = np.zeros(len(whole.data))
-        values[np.searchsorted(keys(whole), keys(lower))] = lower.data
-        return whole.indptr, whole.indices, values
-
-    def _selected(self, groups: Ints, columns: Ints, values: Floats) -> tuple[Floats, Floats]:
+    def _selected(self, tree: _Tree, groups: Ints, columns: Ints, values: Floats) -> tuple[Floats, Floats]:
         """Return what `blocks` does, scaled, of a sparse inverse (Takahashi, Fagan and Chin 1973), front by front.
 
-        For columns J of L with the same rows R below them: with G = L_RJ L_JJ^-1, Z_RJ = -Z_RR G and
+        For columns J of L with rows R below them: with G = L_RJ L_JJ^-1, Z_RJ = -Z_RR G and
         Z_JJ = (L_JJ D_J L_JJ^T)^-1 - G^T Z_RJ. R is part of the front (J and R together) that R's first row is in.
         """
         from scipy.linalg.lapack import dtrtri
 
-        count, lu = self.count, self._lu
-        place = lu.perm_c[self._place]
-        starts, rows, lower = self._lower()
-        pivots = lu.U.diagonal()
-        lengths = np.diff(starts)
-        following = np.full(count, -1)
-        following[lengths > 1] = rows[starts[:-1][lengths > 1] + 1]
-        # A column that has its right neighbour's rows and that neighbour itself is of the same front.
-        opens = np.ones(count + 1, dtype=bool)
-        opens[1:-1] = (following[:-1] != np.arange(1, count)) | (lengths[:-1] != lengths[1:] + 1)
-        bounds = np.flatnonzero(opens)
-        of_front = np.cumsum(opens[:-1]) - 1
-        parents = np.where(following[bounds[1:] - 1] >= 0, of_front[following[bounds[1:] - 1]], -1)
-        children = np.bincount(parents[parents >= 0], minlength=len(parents)).tolist()
+        count, moved = self.count, self._lu.perm_c
+        # SuperLU may have taken branches of the tree in another order.
+        lower = self._lu.L.tocsc()[:, moved]
+        back = np.empty(count, dtype=np.int64)
+        back[moved] = np.arange(count)
+        rows, starts = back[lower.indices], lower.indptr
+        pivots = self._lu.U.diagonal()[moved]
+        bounds = tree.bounds
+        of_front = np.repeat(np.arange(len(tree.below)), np.diff(bounds))
+        parents = [int(of_front[below[0]]) if len(below) else -1 for below in tree.below]
+        children = np.bincount([one for one in parents if one >= 0], minlength=len(parents)).tolist()
         # Each group is found in the front that has its first unknown. The place `count`, after all unknowns, is for -1.
-        places = [np.where(one >= 0, place[one], count) for one in (groups, columns)]
+        places = [np.where(one >= 0, tree.place[one], count) for one in (groups, columns)]
         wanted = []
         for one in places:
             front = of_front[np.minimum(one.min(axis=1, initial=count), count - 1)]
@@ -142,15 +117,16 @@ class Normal:
         fronts: dict[int, tuple[Ints, Floats]] = {}
         for number in range(len(parents) - 1, -1, -1):
             begin, end = int(bounds[number]), int(bounds[number + 1])
-            members, width = rows[starts[begin] : starts[begin + 1]], end - begin
+            width, part = end - begin, slice(starts[begin], starts[end])
+            members = np.concatenate([np.arange(begin, end), tree.below[number]])
             L = np.zeros((len(members), width))
-            for k in range(width):
-                L[k:, k] = lower[starts[begin + k] : starts[begin + k + 1]]
+            beside = np.repeat(np.arange(width), np.diff(starts[begin : end + 1]))
+            L[np.searchsorted(members, rows[part]), beside] = lower.data[part]
             inverse = dtrtri(L[:width], lower=1, unitdiag=1)[0]
             Z = np.empty((len(members), len(members)))
             Z[:width, :width] = inverse.T @ (inverse / pivots[begin:end, None])
             if len(members) > width:
-                parent = int(parents[number])
+                parent = parents[number]
                 members_of, Z_of = fronts[parent]
                 inside = np.searchsorted(members_of, members[width:])
                 Z_RR = Z_of[inside[:, None], inside]
@@ -173,14 +149,76 @@ class Normal:
         return found, forms
 
 
-def _elimination(rows: Ints, blocks: Ints, count: int) -> Ints:
-    """Return the order of least fill between blocks (Liu's minimum degree, by a matrix of their neighbourhood)."""
+class _Tree:
+    """The elimination tree of rows' unknowns (Liu 1990), block by block, and its fronts: unknowns of one dense part.
+
+    order, place: (n,), the unknown at each place, a postorder, and the place of each unknown. bounds: (f + 1,), places
+    at which fronts begin. below: of each front the places of the other unknowns that L has in its columns, in order.
+    """
+
+    def __init__(self, rows: Ints, columns: Ints, blocks: Ints) -> None:
+        beside, rank = _least_fill(rows, blocks[columns])
+        count, turn = len(rank), np.argsort(rank)
+        widths = np.bincount(blocks)[turn].tolist()
+        # By rank, from here on.
+        starts, ends = beside.indptr.tolist(), rank[beside.indices].tolist()
+        under: list[set[int]] = []
+        children: list[list[int]] = [[] for _ in range(count)]
+        sizes, parents = list(widths), [-1] * count
+        for k, block in enumerate(turn.tolist()):
+            here = {other for other in ends[starts[block] : starts[block + 1]] if other > k}
+            here.update(*(under[child] for child in children[k]))
+            here.discard(k)
+            under.append(here)
+            if here:
+                parents[k] = parent = min(here)
+                children[parent].append(k)
+                sizes[parent] += sizes[k]
+        post: list[int] = []
+        stack = [k for k in range(count) if parents[k] < 0]
+        while stack:
+            post.append(stack.pop())
+            stack += children[post[-1]]
+        post.reverse()
+        tops: list[int] = []
+        for k in post:
+            if sizes[k] <= WIDE and parents[k] >= 0 and sizes[parents[k]] <= WIDE:
+                continue
+            # The last front goes on with a block that has the same other blocks below it.
+            if tops and parents[tops[-1]] == k and len(under[tops[-1]]) == len(under[k]) + 1:
+                tops.pop()
+            tops.append(k)
+        at = np.empty(count, dtype=np.int64)
+        at[post] = np.arange(count)
+        first = np.concatenate([[0], np.cumsum(np.array(widths)[post])])
+        self.bounds = np.concatenate([[0], first[at[tops] + 1]])
+        self.order = np.argsort(at[rank[blocks]], kind="stable")
+        self.place = np.empty(len(blocks), dtype=np.int64)
+        self.place[self.order] = np.arange(len(blocks))
+        self.below = []
+        for k in tops:
+            parts = np.sort(at[list(under[k])])
+            many = first[parts + 1] - first[parts]
+            self.below.append(np.repeat(first[parts] - np.cumsum(many) + many, many) + np.arange(many.sum()))
+
+
+def _least_fill(rows: Ints, blocks: Ints) -> tuple[Any, Ints]:
+    """Return which blocks meet in a row, (b, b), and the rank of each in an order of little fill (b,).
+
+    The order is Liu's minimum degree; blocks in very many rows are last.
+    """
     from scipy.sparse import csc_array
     from scipy.sparse.linalg import splu
 
-    early = blocks >= 0
-    met = csc_array((np.ones(early.sum()), (blocks[early], rows[early])), shape=(blocks.max() + 1, count))
+    met = csc_array((np.ones(len(rows)), (blocks, rows)), shape=(blocks.max() + 1, rows.max() + 1))
     met.data[:] = 1.0
     beside = (met @ met.T).tocsc()
-    beside.setdiag(beside.sum(axis=0) + 1)
-    return np.asarray(splu(beside, permc_spec="MMD_AT_PLUS_A", **SYMMETRIC).perm_c)
+    often = np.bincount(met.indices) > OFTEN * math.sqrt(beside.shape[0])
+    seldom = np.flatnonzero(~often)
+    rank = np.empty(len(often), dtype=np.int64)
+    if len(seldom):
+        between = beside[seldom][:, seldom].tocsc()
+        between.setdiag(between.sum(axis=0) + 1)
+        rank[seldom] = splu(between, permc_spec="MMD_AT_PLUS_A", **SYMMETRIC).perm_c
+    rank[often] = np.arange(len(seldom), len(often))
+    return beside, rank

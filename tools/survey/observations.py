@@ -59,7 +59,6 @@ class Observations:
     leg: list[int] = field(default_factory=list)
     what: list[str] = field(default_factory=list)
     robust: list[bool] = field(default_factory=list)
-    early: list[bool] = field(default_factory=list)
     rows: dict[tuple[int, str], int] = field(default_factory=dict)
     loosen: dict[int, tuple[int, float]] = field(default_factory=dict)
     vectors_m: Floats = field(default_factory=lambda: np.empty((0, 3)))
@@ -76,17 +75,16 @@ class Observations:
         """Number of unknowns."""
         return 3 * len(self.stations) + len(self.names)
 
-    def unknown(self, name: str, sigma: float | None = None, value: float = 0.0, *, early: bool = False) -> int:
+    def unknown(self, name: str, sigma: float | None = None, value: float = 0.0) -> int:
         """Return the number of an instrument's unknown, made at its first use.
 
         sigma: 1 sd of what is known of it beforehand, itself an observation; None: nothing. value: where the search
-        begins. early: it stands in few rows.
+        begins.
         """
         if name not in self._unknown:
             self._unknown[name] = column = self.count
             self.names.append(name)
             self.start_values.append(value)
-            self.early.append(early)
             if sigma is not None:
                 self.add("number", -1, -1, value, sigma, [(column, 1.0)], what=name)
         return self._unknown[name]
@@ -174,10 +172,9 @@ class Model:
         self.term_row = np.array(of._term_row, dtype=np.int64)
         self.term_column = np.array(of._term_column, dtype=np.int64)
         self.term_value = np.array(of._term_value, dtype=float)
-        early = np.flatnonzero(of.early)
-        self.blocks = np.full(self.count, -1)
+        # A station's three coordinates are eliminated together.
+        self.blocks = np.arange(self.count) - 2 * self.stations
         self.blocks[: 3 * self.stations] = np.arange(3 * self.stations) // 3
-        self.blocks[3 * self.stations + early] = self.stations + np.arange(len(early))
         self.is_angle = np.isin(self.kind, ANGLES)
         self.lines = np.flatnonzero(self.kind <= _RISE)
         self.base_m = np.full((len(self.lines), 3), np.nan)
