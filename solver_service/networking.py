@@ -26,6 +26,8 @@ from msgspec import UNSET
 NET: Final = "main"
 # Rows come at the track's rate, but at no more than this: each instant has a row of every node.
 MOST_HZ: Final = 20.0
+# What absurd but finite values lead to, such as a depth of 1e308 m. Any other error is a fault of this program.
+NUMERIC_ERRORS: Final = (ArithmeticError, np.linalg.LinAlgError)
 
 
 class NetTracker:
@@ -94,7 +96,7 @@ class NetTracker:
         with np.errstate(all="ignore"):
             try:
                 return self._take(fixes, self._frontier_ns())
-            except (ArithmeticError, ValueError) as error:
+            except NUMERIC_ERRORS as error:
                 self._note([f"values were out of numeric range ({error}): the network started anew"])
                 self.forget()
                 return self._told([])
@@ -107,7 +109,7 @@ class NetTracker:
             try:
                 messages = self._take([], max(self._settled_ns.values(), default=0) + S_NS)
                 return messages + (self._rest(self._filter) if self._filter is not None else [])
-            except (ArithmeticError, ValueError) as error:
+            except NUMERIC_ERRORS as error:
                 self._note([f"values were out of numeric range ({error}): the network started anew"])
                 self.forget()
                 return self._told([])
@@ -117,7 +119,7 @@ class NetTracker:
         with np.errstate(all="ignore"):
             try:
                 return [self._message(row) for row in track.finish()]
-            except (ArithmeticError, ValueError):
+            except NUMERIC_ERRORS:
                 return []
 
     def _told(self, messages: list[Message]) -> list[Message]:

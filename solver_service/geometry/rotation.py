@@ -106,6 +106,8 @@ def rotation_exp(w_rad: Floats) -> Floats:
 def _one_exp(x: float, y: float, z: float) -> tuple[float, ...]:
     """The same of one, as nine numbers: a tracker asks for a few at a time."""
     half = max(0.5 * math.sqrt(x * x + y * y + z * z), _TINY)
+    # An endless turn has no matrix; math.sin would refuse it.
+    half = half if half < math.inf else math.nan
     sine = math.sin(half) / half
     first, second = sine * math.cos(half), 0.5 * sine * sine
     xy, xz, yz = second * x * y, second * x * z, second * y * z

@@ -8,7 +8,6 @@ The estimate that explains the pictures best is followed. Without fixed nodes th
 from __future__ import annotations
 
 import heapq
-import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -257,10 +256,10 @@ def _in_reach(before: tuple[float, PairFix], now: tuple[float, PairFix]) -> bool
     span_s = now_s - before_s
     if span_s > JOIN_WITHIN_S:
         return False
-    sigma_m = math.sqrt(float(np.trace(one.covariance[:3, :3] + two.covariance[:3, :3])))
+    sigma_m = float(np.sqrt(np.trace(one.covariance[:3, :3] + two.covariance[:3, :3])))
     range_m = float(np.linalg.norm(two.t_a_b_m))
     reach_m = (REACH_MPS + REACH_RADPS * range_m) * span_s + 4.0 * sigma_m
-    sigma_rad = math.sqrt(float(np.trace(one.covariance[3:, 3:] + two.covariance[3:, 3:])))
+    sigma_rad = float(np.sqrt(np.trace(one.covariance[3:, 3:] + two.covariance[3:, 3:])))
     turned = float(np.linalg.norm(rotation_log(two.R_a_b @ one.R_a_b.T)))
     moved_m = float(np.linalg.norm(two.t_a_b_m - one.t_a_b_m))
     return moved_m < reach_m and turned < 2.0 * REACH_RADPS * span_s + 4.0 * sigma_rad

@@ -70,3 +70,10 @@ def test_many_rotations_are_turned_back_as_each_alone():
     np.testing.assert_allclose(matrix_to_quat(R).reshape(-1, 4), one_by_one, atol=1e-15)
     one_by_one = [rotation_log(each) for each in R.reshape(-1, 3, 3)]
     np.testing.assert_allclose(rotation_log(R).reshape(-1, 3), one_by_one, atol=1e-15)
+
+
+def test_an_endless_turn_has_no_matrix_however_many_are_asked_for():
+    endless = np.full(3, 1e200)
+    with np.errstate(all="ignore"):
+        assert np.isnan(rotation_exp(endless)).all()
+        assert np.isnan(rotation_exp(np.tile(endless, (40, 1)))).all()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from buddyline.protocol.messages import Candidates, FixedPlace, LightTruth, Mess
 from buddyline.solver_service.config import SolveConfig, track_settings
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, rotation_log
+from buddyline.solver_service.network.filter import NetFilter
 from msgspec.structs import replace
 
 START_NS = 1_764_000_000_000_000_000
@@ -204,6 +205,27 @@ def test_absurd_values_end_nothing() -> None:
     poses, _ = solved(spoilt)
     found = errors(world, poses)
     assert all(np.median(found[node][:, 0]) < 0.1 for node in "bcd")
+
+
+@pytest.mark.parametrize("error", [ValueError("a fault"), np.linalg.LinAlgError("Singular matrix")])
+def test_only_what_absurd_values_lead_to_begins_the_network_anew(
+    error: ValueError, four: tuple[World, list[Message], list[NodePose]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fault of this program must not look like a lack of poses."""
+
+    def fails(*_: object) -> NoReturn:
+        raise error
+
+    monkeypatch.setattr(NetFilter, "advance", fails)
+    messages = first_seconds(four[1], 0.5)
+    if not isinstance(error, np.linalg.LinAlgError):
+        with pytest.raises(ValueError, match="a fault"):
+            solved(messages)
+        return
+    poses, core = solved(messages)
+    assert poses == []
+    assert core.network is not None
+    assert core.network.problems == ["values were out of numeric range (Singular matrix): the network started anew"]
 
 
 @pytest.mark.slow
