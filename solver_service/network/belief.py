@@ -21,6 +21,8 @@ from buddyline.solver_service.network.state import (
     MOVING,
     P_,
     PHI,
+    SHAKE,
+    SHOVE,
     V_,
     NetState,
     block,
@@ -78,13 +80,15 @@ class Member:
 class NetBelief:
     """The state and covariance of all members, moved on by inertial samples and updated by the nodes' own sensors.
 
-    intake: what all nodes have told. places: of the fixed nodes, by index. members, state, covariance, rates_radps,
-    shaking and t_s: as they are now. trail: what led there, None where nothing is smoothed.
+    intake: what all nodes have told. places: of the fixed nodes, by index. shaken: logs (2,) of the variances of nodes'
+    shaking, where an earlier pass has told them. members, state, covariance, rates_radps, shaking and t_s: as they are
+    now. trail: what led there, None where nothing is smoothed.
     """
 
     def __init__(self, intake: TrackIntake) -> None:
         self.intake = intake
         self.places: dict[int, KnownPlace] = {}
+        self.shaken: dict[int, Floats] = {}
         self.members: list[Member] = []
         self.state: NetState | None = None
         self.covariance: Floats = np.zeros((0, 0))
@@ -131,6 +135,9 @@ class NetBelief:
     def _add(self, member: Member, state: NetState, own: Floats, by: Floats | None = None) -> None:
         """Add a member with its covariance (BLOCK, BLOCK). by (BLOCK, N): its errors by those so far."""
         across = None if by is None else self.covariance @ by.T
+        told = self.shaken.get(member.node)
+        if told is not None:
+            own[SHAKE, SHAKE], own[SHOVE, SHOVE] = (variance * np.eye(3) for variance in np.exp(told))
         if self.trail is not None:
             self.trail.events.append(Grown(np.zeros((BLOCK, len(self.covariance))) if by is None else by))
         if self.state is None:
@@ -146,7 +153,7 @@ class NetBelief:
             P[:N, N:], P[N:, :N] = across, across.T
         self.covariance = P
         self.members.append(member)
-        self.shaking = self.shaking.joined()
+        self.shaking = self.shaking.joined(told)
         self.rates_radps = np.concatenate((self.rates_radps, np.zeros((1, 3))))
 
     def remove(self, index: int) -> None:

@@ -7,6 +7,7 @@ The estimate that explains the pictures best is followed. Without fixed nodes th
 
 from __future__ import annotations
 
+import copy
 import heapq
 from collections.abc import Sequence
 from typing import Final
@@ -21,6 +22,7 @@ from buddyline.solver_service.network.trail import NetTrail
 from buddyline.solver_service.track.inputs import FixSeen, TrackNode
 from buddyline.solver_service.track.intake import CHECK_EVERY_S, TrackIntake, newest_before
 from buddyline.solver_service.track.lights import Sight
+from buddyline.solver_service.track.problems import Problems
 from buddyline.solver_service.track.samples import Samples
 from buddyline.solver_service.track.stepping import HOLD_S, TOGETHER_S
 from buddyline.solver_service.track.turning import Turning
@@ -45,6 +47,8 @@ CONTRADICTIONS: Final = 10
 MEMORY_S: Final = 30.0
 # Rows are smoothed by what comes in this time after them at least, and in twice this time at most.
 LATER_S: Final = 10.0
+# How the units are shaken is learned from so much of a dive's beginning before what is smoothed begins.
+REHEARSED_S: Final = 20.0
 # Rows come after all else of their time.
 ROW: Final = 1 << 20
 
@@ -61,6 +65,9 @@ class NetFilter(TrackIntake):
         super().__init__([])
         self.main = NetEstimate(self)
         self.smooths = smooths
+        self._rehearses = smooths
+        # Up to when all has been added.
+        self._end_s = -np.inf
         if smooths:
             self.main.trail = NetTrail()
         # Up to when rows have been smoothed.
@@ -104,10 +111,17 @@ class NetFilter(TrackIntake):
         Events within HOLD_S of to_ns wait for the next call, so that the result does not depend on how often it is
         called.
         """
-        end_s = self.seconds(0, to_ns) - HOLD_S
-        rows: list[NetRow] = []
+        self._end_s = self.seconds(0, to_ns) - HOLD_S
         for stamp_ns in outputs_ns:
             self._push(self.seconds(0, stamp_ns), ROW, stamp_ns)
+        if self._rehearses and (not self._events or self._end_s < self._events[0][0] + REHEARSED_S):
+            return []
+        return self._go_on(self._end_s)
+
+    def _go_on(self, end_s: float) -> list[NetRow]:
+        if self._rehearses:
+            self._rehearse()
+        rows: list[NetRow] = []
         while self._events and self._events[0][0] <= end_s:
             t_s, _, _, what = heapq.heappop(self._events)
             if isinstance(what, int):
@@ -121,7 +135,23 @@ class NetFilter(TrackIntake):
 
     def finish(self) -> list[NetRow]:
         """Return the rows that have not been smoothed yet, at the end of the dive."""
-        return self._smooth(np.inf) if self.smooths else []
+        return self._go_on(self._end_s) + self._smooth(np.inf) if self.smooths else []
+
+    def _rehearse(self) -> None:
+        """Learn how the units are shaken from the dive's beginning, whose own rows need it already."""
+        self._rehearses = False
+        if not self._events:
+            return
+        trial = copy.copy(self)
+        trial.smooths, trial.main = False, self.main.copied()
+        trial.main.trail = None
+        trial.challengers, trial._watches, trial._problems = [], {}, Problems()
+        trial._fixes, trial._challenged_s, trial._contradicted = {}, {}, {}
+        trial._rejected = self._rejected.copy()
+        trial._events = sorted(event for event in self._events if event[1] != ROW)
+        trial._go_on(self._events[0][0] + REHEARSED_S)
+        learned = zip(trial.main.members, trial.main.shaking.logs, strict=True)
+        self.main.shaken = {member.node: logs for member, logs in learned}
 
     def _rows(self, t_s: float, stamp_ns: int) -> list[NetRow]:
         if not self.smooths:

@@ -50,13 +50,14 @@ class NetShaking:
         """Of each member's angle and velocity (n, 2)."""
         return np.asarray(np.exp(self.logs))
 
-    def joined(self) -> NetShaking:
-        """Return it with one more member, of which nothing is known."""
+    def joined(self, told: Floats | None = None) -> NetShaking:
+        """Return it with one more member. told (2,): the logs of its variances by an earlier pass, None where nothing
+        is known of it."""
         n = len(self.logs)
         information = np.zeros((2 * n + 2, 2 * n + 2))
         information[: 2 * n, : 2 * n] = self.information
         information[2 * n :, 2 * n :] = 0.5 * FIRST * np.eye(2)
-        first = 2.0 * np.log(np.array(((SHAKE_RAD, SHOVE_MPS),)))
+        first = 2.0 * np.log(np.array(((SHAKE_RAD, SHOVE_MPS),))) if told is None else told[None]
         more = np.zeros((1, 2, MOVING, MOVING))
         return NetShaking(np.concatenate((self.logs, first)), information, np.concatenate((self.parts, more)))
 

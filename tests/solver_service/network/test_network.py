@@ -15,6 +15,7 @@ from buddyline.protocol.messages import Candidates, FixedPlace, LightTruth, Mess
 from buddyline.solver_service.config import SolveConfig, track_settings
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, rotation_log
+from buddyline.solver_service.network import filter as filter_module
 from buddyline.solver_service.network.filter import NetFilter
 from msgspec.structs import replace
 
@@ -97,6 +98,28 @@ def test_the_smoothed_network_is_better_than_the_filter_and_as_honest(
     for node in "bcd":
         assert np.sqrt(np.square(after[node][:, 0]).mean()) < 0.8 * np.sqrt(np.square(before[node][:, 0]).mean())
         assert 0.3 < after[node][:, 2].mean() < 1.6
+
+
+def test_the_smoothed_rows_of_the_beginning_count_what_the_dive_tells_of_shaking(
+    four: tuple[World, list[Message], list[NodePose]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its units are screwed to their cameras: attitudes are known better than before the dive has told so."""
+    messages = first_seconds(four[1], 3.0)
+    told = sigma_rad(solved(messages, mode="smooth")[0])
+    monkeypatch.setattr(filter_module, "REHEARSED_S", 0.0)
+    untold = sigma_rad(solved(messages, mode="smooth")[0])
+    assert told.keys() == untold.keys()
+    assert all(told[node] < 0.97 * untold[node] for node in told)
+
+
+def sigma_rad(poses: list[NodePose]) -> dict[str, float]:
+    """The moving nodes' mean sigma of their attitudes in the first second."""
+    found: dict[str, list[float]] = {}
+    for pose in poses:
+        if not pose.fixed and pose.stamp_ns < START_NS + S_NS:
+            variance = np.trace(np.array(pose.covariance).reshape(6, 6)[3:, 3:])
+            found.setdefault(pose.node, []).append(float(np.sqrt(variance)))
+    return {node: float(np.mean(sigmas)) for node, sigmas in found.items()}
 
 
 def test_without_a_fixed_node_the_frame_moves_with_one() -> None:
