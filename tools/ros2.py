@@ -117,7 +117,8 @@ def run(args: argparse.Namespace) -> int:
                         client.refusals.note(envelope.key, error)
 
             states = (topics.INFO, topics.NODE_STATUS, topics.SOLVER_STATUS)
-            streams = (topics.ATTITUDE, topics.DEPTH, topics.POSE, topics.TRACK, topics.TRACK_LAG, topics.REJECTED)
+            of_pairs = (topics.POSE, topics.TRACK, topics.TRACK_LAG, topics.REJECTED)
+            streams = (topics.ATTITUDE, topics.DEPTH, *of_pairs, topics.NET_POSE)
             follow_running(bus, states, streams, client.refusals, publish)
             client.wait()
         finally:

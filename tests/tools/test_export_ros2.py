@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.messages import Message
+from buddyline.protocol.messages import Message, NodePose
 from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from buddyline.tools.cli import main
 from msgspec.structs import replace
@@ -44,7 +44,11 @@ def spoken() -> list[Message]:
             replace(pose(k), covariance=mixed(6)) if k % 5 else rejection(k),
             replace(estimate, v_a_b_mps=(0.1 / 3, -0.2, 0.7), v_covariance=mixed(3)),
         ]
-    return [*said, image("a", at(3)), status("a", at(4), "camera: gone"), solver_status(at(5))]
+    of_net = NodePose(
+        net="main", node="a", stamp_ns=at(6), p_m=(1.0, 2.0, 3.0), q_xyzw=quaternion(), v_mps=(0.4, 0.0, 0.0),
+        covariance=mixed(6), fixed=False, mode="smooth", age_s=0.0,
+    )  # fmt: skip
+    return [*said, of_net, image("a", at(3)), status("a", at(4), "camera: gone"), solver_status(at(5))]
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +96,7 @@ class TestRos2:
             "/buddyline/a/b/pose": 16,
             "/buddyline/a/b/track": 20,
             "/buddyline/a/b/range": 20,
+            "/buddyline/net/main/a": 1,
             "/buddyline/a/camera/image/compressed": 1,
             "/buddyline/a/camera/camera_info": 1,
             "/diagnostics": 5,

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from buddyline.protocol.clock import S_NS, ManualClock
 from buddyline.protocol.errors import MessageError
-from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message
+from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message, NodePose
 from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from buddyline.tools.export.ros_messages import RosMessage, Translation, name_of, type_store
 from buddyline.tools.ros2 import RosGraph, attachment, dds_type
@@ -98,6 +98,25 @@ def test_a_track_is_an_odometry_with_its_twist_in_b_s_frame(store: Any) -> None:
     of_twist = value.twist.covariance.reshape(6, 6)
     np.testing.assert_allclose(R_a_b @ of_twist[:3, :3] @ R_a_b.T, mixed @ mixed.T, atol=1e-12)
     assert of_twist[5, 5] == 1e6
+
+
+def test_each_node_of_a_net_is_an_odometry_in_east_north_up(store: Any) -> None:
+    """It looks north, level, and swims forward: its camera's z is the north, its x the east."""
+    forward = (0.5, 0.5, 0.5, 0.5)
+    variances = np.diag([1.0, 4.0, 9.0, 0.01, 0.02, 0.03])
+    told = NodePose(
+        net="main", node="3", stamp_ns=at(0), p_m=(1.0, 2.0, 3.0), q_xyzw=forward, v_mps=(0.4, 0.0, 0.0),
+        covariance=variances.ravel().tolist(), fixed=False, mode="filter", age_s=0.0,
+    )  # fmt: skip
+    value = of(translated(store, told), "/buddyline/net/main/node_3")
+    assert (value.header.frame_id, value.child_frame_id) == ("net_main", "node_3_camera")
+    place, linear = value.pose.pose.position, value.twist.twist.linear
+    assert (place.x, place.y, place.z) == (2.0, 1.0, -3.0)
+    np.testing.assert_allclose(turned(value.pose.pose.orientation, (0.0, 0.0, 1.0)), (0.0, 1.0, 0.0), atol=1e-12)
+    np.testing.assert_allclose(turned(value.pose.pose.orientation, (1.0, 0.0, 0.0)), (1.0, 0.0, 0.0), atol=1e-12)
+    np.testing.assert_allclose((linear.x, linear.y, linear.z), (0.0, 0.0, 0.4), atol=1e-12)
+    assert np.diag(value.pose.covariance.reshape(6, 6)).tolist() == pytest.approx([4.0, 1.0, 9.0, 0.02, 0.01, 0.03])
+    assert (np.diag(value.twist.covariance.reshape(6, 6)) == 1e6).all()
 
 
 def test_the_transform_of_b_follows_the_track_that_is_not_late(store: Any) -> None:

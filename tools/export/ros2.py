@@ -8,13 +8,15 @@ from typing import Any, Final
 
 from buddyline.protocol.divelog import CHUNK_NS
 from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.topics import NET_POSE
 from buddyline.tools.dives import Dive
 from buddyline.tools.export.ros_messages import Translation, type_store
 from buddyline.tools.newfile import new_file
 
 log = logging.getLogger(__name__)
 
-TOPICS: Final = ("info", "attitude", "depth", "image", "pose", "track", "track_lag", "rejected", "node_status")
+OF_NODES: Final = ("info", "attitude", "depth", "image", "node_status", NET_POSE.name)
+TOPICS: Final = (*OF_NODES, "pose", "track", "track_lag", "rejected")
 
 
 def export(dive: Dive, output: Path, what: str | None = None) -> int:

@@ -21,6 +21,7 @@ from buddyline.protocol.messages import (
     Depth,
     Message,
     NodeInfo,
+    NodePose,
     NodeStatus,
     Rejected,
     RelativePose,
@@ -102,6 +103,8 @@ class Translation:
         elif isinstance(message, Track):
             self._camera.base = message.node_a
             yield from self._track(message)
+        elif isinstance(message, NodePose):
+            yield self._node_pose(message)
         elif isinstance(message, CompressedImage):
             yield from self._picture(message)
         elif isinstance(message, Rejected):
@@ -233,31 +236,48 @@ class Translation:
         """
         a, b = name_of(track.node_a), name_of(track.node_b)
         R_a_b = quat_to_matrix(np.array(track.q_a_b_xyzw))
-        x, y, z = (R_a_b.T @ np.array(track.v_a_b_mps)).tolist()
-        of_twist = UNKNOWN_VARIANCE * np.eye(6)
-        of_twist[:3, :3] = R_a_b.T @ np.array(track.v_covariance).reshape(3, 3) @ R_a_b
         placed = self._posed(track.stamp_ns, f"{a}_camera", track.t_a_b_m, R_a_b, np.array(track.covariance))
-        value = self._new(
-            ODOMETRY_TYPE,
-            header=placed.header,
-            child_frame_id=f"{b}_camera",
-            pose=placed.pose,
-            twist=self._new(
-                "geometry_msgs/msg/TwistWithCovariance",
-                twist=self._new(
-                    "geometry_msgs/msg/Twist",
-                    linear=self._new("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-                    angular=self._new("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0),
-                ),
-                covariance=of_twist.ravel(),
-            ),
-        )
+        of_velocity = R_a_b.T @ np.array(track.v_covariance).reshape(3, 3) @ R_a_b
+        value = self._odometry(placed, f"{b}_camera", R_a_b.T @ np.array(track.v_a_b_mps), of_velocity)
         late = track.mode == "lag"
         yield RosMessage(f"/buddyline/{a}/{b}/{'track_lag' if late else 'track'}", ODOMETRY_TYPE, value)
         if not late:
             self._tracked_ns[a, b] = track.stamp_ns
             yield self._range(track)
             yield self._transform(track.stamp_ns, f"{a}_camera", f"{b}_camera", track.t_a_b_m, R_a_b)
+
+    def _node_pose(self, pose: NodePose) -> RosMessage:
+        """Return a node's pose in its net's frame, here east-north-up, as an odometry of its camera.
+
+        The velocity is in the camera's frame, without a covariance: NodePose has none.
+        """
+        net, node = name_of(pose.net), name_of(pose.node)
+        R_net_camera = quat_to_matrix(np.array(pose.q_xyzw))
+        x, y, z = (R_ENU_NED @ np.array(pose.p_m)).tolist()
+        turn = np.kron(np.eye(2), R_ENU_NED)
+        covariance = (turn @ np.array(pose.covariance).reshape(6, 6) @ turn.T).ravel()
+        placed = self._posed(pose.stamp_ns, f"net_{pose.net}", (x, y, z), R_ENU_NED @ R_net_camera, covariance)
+        velocity_mps, unknown = R_net_camera.T @ np.array(pose.v_mps), UNKNOWN_VARIANCE * np.eye(3)
+        value = self._odometry(placed, f"{node}_camera", velocity_mps, unknown)
+        return RosMessage(f"/buddyline/net/{net}/{node}", ODOMETRY_TYPE, value)
+
+    def _odometry(self, placed: Any, child: str, velocity_mps: Any, of_velocity: Any) -> Any:
+        """Return the odometry of a child frame at a placed pose; its velocity and covariance are in that frame."""
+        x, y, z = velocity_mps.tolist()
+        of_twist = UNKNOWN_VARIANCE * np.eye(6)
+        of_twist[:3, :3] = of_velocity
+        twist = self._new(
+            "geometry_msgs/msg/Twist",
+            linear=self._new("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+            angular=self._new("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0),
+        )
+        return self._new(
+            ODOMETRY_TYPE,
+            header=placed.header,
+            child_frame_id=child,
+            pose=placed.pose,
+            twist=self._new("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=of_twist.ravel()),
+        )
 
     def _posed(self, stamp_ns: int, frame_id: str, t_m: tuple[float, float, float], R: Any, covariance: Any) -> Any:
         x, y, z = t_m
