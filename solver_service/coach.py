@@ -23,6 +23,8 @@ OLD_S: Final = 20.0
 VAGUE_SHARE: Final = 0.2
 # Why there is no pose where lights are not found: too little is in the picture, or only what is no light.
 UNSEEN: Final = ("too_few_candidates", "ambiguous")
+# With fewer lights there is no pose.
+FEW: Final = 3
 # A diver who looks at the other and finds no lights comes closer by this share of the range, but not below NEAR_M.
 CLOSER_SHARE: Final = 0.25
 NEAR_M: Final = 2.0
@@ -32,7 +34,8 @@ NEAR_M: Final = 2.0
 class LastPlace:
     """Where B last was as A sees it: t_m (3,), R (3, 3) of T_a_b, sigma_m of the place, and its age.
 
-    why: the rejection reason for which triggers give no pose now; "" where they give poses. turned: the turns (3, 3) of
+    why: the rejection reason for which triggers give no pose now; "" where they give poses. told: how many different
+    lights the last trigger told the track; a pose tells of itself. turned: the turns (3, 3) of
     A's and B's cameras since then, R_then_now, from their attitude sensors.
     """
 
@@ -42,6 +45,7 @@ class LastPlace:
     age_s: float
     why: str = ""
     turned: tuple[Floats, Floats] | None = None
+    told: int = 4
 
     @staticmethod
     def of(
@@ -50,7 +54,7 @@ class LastPlace:
         """Return the place that an estimate says."""
         t_m, R = np.array(estimate.t_a_b_m), quat_to_matrix(np.array(estimate.q_a_b_xyzw))
         sigma_m = math.sqrt(sum(max(estimate.covariance[i], 0.0) for i in (0, 7, 14)))
-        return LastPlace(t_m, R, sigma_m, age_s, why, turned)
+        return LastPlace(t_m, R, sigma_m, age_s, why, turned, estimate.lights if isinstance(estimate, Track) else 4)
 
     @property
     def range_m(self) -> float:
@@ -77,13 +81,15 @@ def advise(
     place: LastPlace | None,
     dark: Iterable[tuple[int, int]] = (),
     looks: Sequence[NodeLook] = (),
+    unseen: Iterable[tuple[int, int]] = (),
 ) -> list[str]:
     """Return what to do, such as "turn b 20 deg left"; empty where all is well, or nothing is known.
 
     infos: of A and B. dark: lamps that are dark, as node (0: A) and light (0: left). looks: of A and B, for where
-    no place tells a direction; empty where they say nothing.
+    no place tells a direction; empty where they say nothing. unseen: lamps that may be dark, or covered, or too faint.
     """
-    said = [f"{('left', 'right')[light]} lamp of {infos[node].node} is dark" for node, light in dark]
+    named = {lamp: "is not seen" for lamp in unseen} | dict.fromkeys(dark, "is dark")
+    said = [f"{('left', 'right')[light]} lamp of {infos[node].node} {what}" for (node, light), what in named.items()]
     if place is None or not place.tells:
         return said + (advise_first(infos, looks) if looks else [])
     seen = place.lights(infos[0], infos[1])
@@ -97,7 +103,8 @@ def _move(infos: Sequence[NodeInfo], place: LastPlace, seen: tuple[Floats, Float
     apart_m = max(_too_near_m(info, lights_m) for info, lights_m in zip(infos, seen, strict=True))
     if apart_m > 0.0:
         return [f"move {math.ceil(apart_m / STEP_M) * STEP_M:.1f} m apart"]
-    if place.why and place.why not in UNSEEN:
+    # Where the lights are lost, what remains is no light: for what reason it is refused says nothing.
+    if place.why and place.why not in UNSEEN and place.told >= FEW:
         return []
     # Lights that are not found are too faint; a poor fix gets better in proportion to the range, or faster.
     wanted_m = range_m * ((1.0 - CLOSER_SHARE) if place.why else TRACK_SIGMA_SHARE * range_m / place.sigma_m)

@@ -162,6 +162,10 @@ class SolverCore:
             for pair in self.pairs.values()
         ]
 
+    def advises_anew(self) -> bool:
+        """Return whether some divers should do something else than the last report has said."""
+        return any(pair.advises_anew() for pair in self.pairs.values())
+
     @property
     def net_poses(self) -> list[tuple[str, str]]:
         """The net and the node of each NodePose that may come."""

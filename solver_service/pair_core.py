@@ -79,6 +79,7 @@ class PairCore:
         self._alone = True
         self._unsettled: list[Matched | Unmatched] = []
         self._settled: list[Message] = []
+        self._advised: list[str] = []
 
     def crowd(self, nodes: int) -> None:
         """Note how many nodes there are: this pair may be the only one, or one of many."""
@@ -171,6 +172,7 @@ class PairCore:
         self.latencies_s.clear()
         p99 = len(latencies_s) * 99 // 100
         offset = self._estimate_offset(now_ns)
+        self._advised = self.advice()
         return SolverStatus(
             node_a=node_a,
             node_b=node_b,
@@ -192,9 +194,13 @@ class PairCore:
                 problems + self._disagreements(offset) + present(self.tracker.problems if self.tracker else [])
             ),
             unused=unused or UNSET,
-            advice=self.advice() or UNSET,
+            advice=self._advised or UNSET,
             late_imu=(self.tracker.late_imu if self.tracker else 0) or UNSET,
         )
+
+    def advises_anew(self) -> bool:
+        """Return whether the divers should do something else than the last report has said."""
+        return self.advice() != self._advised
 
     def advice(self) -> list[str]:
         """Return what the divers should do for a fix or a better one, by the newest data of both nodes."""
@@ -205,19 +211,20 @@ class PairCore:
         if len(infos) < 2:
             return []
         last, place = self._last, None
+        has_fix = self._posed_ns is not None and now_ns - self._posed_ns < NO_POSE_S * S_NS
         if last is not None:
             turned = [
                 self._turned(stream, info, last.stamp_ns) for stream, info in zip(self.streams, infos, strict=True)
             ]
             both = (turned[0], turned[1]) if turned[0] is not None and turned[1] is not None else None
-            has_fix = self._posed_ns is not None and now_ns - self._posed_ns < NO_POSE_S * S_NS
             why = "" if has_fix else next((reason for reason, _ in self._why.most_common(1)), "unmatched")
             place = LastPlace.of(last, max(now_ns - last.stamp_ns, 0) / S_NS, why, both)
         dark = self.tracker.dark_lamps() if self.tracker is not None else ()
+        unseen = self.tracker.unseen_lamps() if self.tracker is not None and not has_fix else ()
         # Where there are more nodes, a light that is seen may be a third one's.
         needed = self._alone and (place is None or not place.tells) and all(s.newest_ns for s in self.streams)
         looks = [look_of(stream, *rig) for stream, rig in zip(self.streams, rigs, strict=True)] if needed else ()
-        return advise(infos, place, dark, looks)
+        return advise(infos, place, dark, looks, unseen)
 
     def _turned(self, stream: NodeStream, info: NodeInfo, since_ns: int) -> Floats | None:
         """Return R_then_now of a node's camera by its attitude sensor, whose slow error cancels; None without one."""

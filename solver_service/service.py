@@ -48,6 +48,8 @@ SOLVED_FROM: Final = (INFO, IMU, ATTITUDE, DEPTH, CANDIDATES)
 # The core gets the time, and the status is published, at these intervals.
 TICK_S: Final = 0.25
 STATUS_S: Final = 1.0
+# Between two statuses it is looked whether the divers' words have changed.
+WORDS_S: Final = 0.5
 MAX_ALIVE_NAME: Final = 64
 WAIT_S: Final = 1.0
 # Within this time the nodes have connected again, sent what was missed, and the solver has waited for all.
@@ -94,6 +96,7 @@ class SolverService(Service):
         # Triggers of which an earlier solver had a frame, and that have no outcome yet; with the frame's stamp.
         self._owed: dict[tuple[PairId, int], int] = {}
         self._owed_until_s = 0.0
+        self._words_s = 0.0
 
     def start(self) -> None:
         """Start all threads."""
@@ -136,7 +139,10 @@ class SolverService(Service):
                     self._publish(self.core.flush())
 
     def tick(self, status_due: bool) -> None:
-        """Resolve triggers whose time has come; report where a status is due, or a node has started or ended."""
+        """Resolve triggers whose time has come; report where a status is due, or the words of one have changed.
+
+        Words change where a node has started or ended, and where divers should do something else.
+        """
         if self._work is not None and self._bus is not None:
             self._share(self._work, self._bus)
         with self._turn():
@@ -145,6 +151,9 @@ class SolverService(Service):
             self._publish(results)
             if self._owed and time.monotonic() > self._owed_until_s:
                 self._give_up_owed()
+            if status_due or time.monotonic() - self._words_s >= WORDS_S:
+                self._words_s = time.monotonic()
+                self._news |= not status_due and self.core.advises_anew()
         if self._news or status_due:
             self.report()
 

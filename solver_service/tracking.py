@@ -39,6 +39,7 @@ from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.foresight import ForeseenLight, foresee
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, TrackNode
 from buddyline.solver_service.track.lag import EVERY_S, KEPT_S, TrackLag
+from buddyline.solver_service.track.lamps import UNSEEN_PICTURES, UNSEEN_S
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.problems import ENDED_S, as_ended
 from msgspec import UNSET
@@ -121,6 +122,11 @@ class PairTracker:
     def dark_lamps(self) -> list[tuple[int, int]]:
         """Return the lamps that are dark now, as node (0: A) and light (0: left)."""
         return [] if self._filter is None else [(node, light) for node, light, _ in self._filter.lamps.dark()]
+
+    def unseen_lamps(self) -> list[tuple[int, int]]:
+        """Return the lamps that may be dark."""
+        found = [] if self._filter is None else self._filter.lamps.dark(UNSEEN_S, UNSEEN_PICTURES)
+        return [(node, light) for node, light, _ in found]
 
     def _dark_lamps(self, dark: Iterable[tuple[int, int, float]]) -> list[str]:
         sides = ("left", "right")

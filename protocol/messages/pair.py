@@ -136,9 +136,9 @@ class Truth(Message, frozen=True, kw_only=True):
 
 
 class SolverStatus(Message, frozen=True, kw_only=True):
-    """Health of the solver, 1 Hz; counts since its start.
+    """Health of the solver, 1 Hz, and sooner where the advice changes; counts since its start.
 
-    latency: from the middle of exposure to the pose, over the poses of the last second (live dives only).
+    latency: from the middle of exposure to the pose, over the poses since the last status (live dives only).
     clock_skew_s: B's clock minus A's, estimated from the dive's own messages; absent until there is an estimate.
     unused: nodes that the solver receives but is configured not to use; absent if there are none.
     advice: what the divers should do for a fix or a better one, a phrase each; absent if there is nothing to do.

@@ -10,6 +10,9 @@ from buddyline.solver_service.geometry.rotation import Floats
 # A diver or a rope hides a lamp for a second or two, chance misses it in a picture or two.
 DARK_S: Final = 6.0
 DARK_PICTURES: Final = 15
+# From here on it is worth a word where there is no pose.
+UNSEEN_S: Final = 1.0
+UNSEEN_PICTURES: Final = 5
 # A lamp that is seen makes up for so many pictures without it; a false candidate in its place does no more.
 SIGHTING: Final = 5
 # Probability from which on a lamp counts as seen.
@@ -37,9 +40,9 @@ class LampWatch:
                 self._missed[node, light] += 1
                 self._last_s[node, light] = t_s
 
-    def dark(self) -> list[tuple[int, int, float]]:
-        """Return node, light and for how long (s) of each lamp that is dark."""
+    def dark(self, after_s: float = DARK_S, pictures: int = DARK_PICTURES) -> list[tuple[int, int, float]]:
+        """Return node, light and for how long (s) of each lamp that is dark: not seen for after_s and in pictures."""
         duration_s = self._last_s - self._since_s
         with np.errstate(invalid="ignore"):
-            found = np.argwhere((duration_s >= DARK_S) & (self._missed >= DARK_PICTURES))
+            found = np.argwhere((duration_s >= after_s) & (self._missed >= pictures))
         return [(node, light, float(duration_s[node, light])) for node, light in found.tolist()]

@@ -91,6 +91,20 @@ def test_a_dark_lamp_is_named() -> None:
     assert advise(PAIR, None, [(1, 0)]) == ["left lamp of b is dark"]
 
 
+def test_a_lamp_that_is_not_seen_is_named_before_it_is_known_to_be_dark() -> None:
+    unseen = [(1, 0), (0, 1)]
+    assert advise(PAIR, None, unseen=unseen) == ["left lamp of b is not seen", "right lamp of a is not seen"]
+    assert advise(PAIR, None, [(1, 0)], unseen=unseen) == ["left lamp of b is dark", "right lamp of a is not seen"]
+
+
+@pytest.mark.parametrize(("told", "words"), [(4, []), (3, []), (2, ["come 2.0 m closer"]), (0, ["come 2.0 m closer"])])
+def test_where_lights_are_lost_the_reason_for_which_others_are_refused_says_nothing(
+    told: int, words: list[str]
+) -> None:
+    lost = stood(0, 0, 0, 0, range_m=8.0)
+    assert advise(PAIR, LastPlace(lost.t_m, lost.R, 0.1, 3.0, "range_gap", told=told)) == words
+
+
 def test_an_old_or_vague_place_tells_no_direction() -> None:
     place = stood(40, 0, 0, 0)
     assert advise(PAIR, LastPlace(place.t_m, place.R, 0.01, 21.0)) == []

@@ -6,21 +6,32 @@ import math
 
 import numpy as np
 import pytest
+from buddyline.node.sim.glow import SCALE_PX, stands_out
 from buddyline.node.sim.scenario import Scenario
+from buddyline.node.sim.scene import Lamp, Scene
 from buddyline.node.sim.trajectory import PairMotion
+from buddyline.protocol.clock import S_NS
 from buddyline.tools.bench.coach import (
     CASES,
+    DIVES,
     NEVER,
     RAMP_S,
+    SEEN_SHARE,
+    START_NS,
     TICK_S,
     TURN_DEGPS,
     WATERS,
     WITHIN_S,
+    Murky,
+    SteeredDive,
     Steering,
     asked_for,
     beginning,
+    fade,
     follow,
     lamps_in_view,
+    lose,
+    missing,
 )
 
 
@@ -52,8 +63,8 @@ def test_a_steered_node_turns_to_the_right_without_a_jump() -> None:
     "case", [f"{NEVER}a lamp beyond each border", f"{NEVER}one looks away", f"{NEVER}one looks up or down"]
 )
 def test_before_the_first_fix_the_words_lead_to_one(case: str) -> None:
-    found = [follow(WATERS[k % len(WATERS)], case, 8800 + k, imu=False) for k in range(4)]
-    counted = [time_s for time_s in found if time_s is not None]
+    dives = [lose(WATERS[k % len(WATERS)], case, 8800 + k, imu=False) for k in range(4)]
+    counted = [follow(dive) for dive in dives if dive is not None]
     assert len(counted) >= 2
     assert sum(time_s <= WITHIN_S for time_s in counted) >= 0.9 * len(counted)
 
@@ -70,6 +81,42 @@ def test_a_dive_begins_without_a_fix_as_its_case_says() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES[:3])
 def test_followed_the_words_give_a_fix_within_five_seconds(case: str) -> None:
-    found = follow("lake", case, 7, imu=False)
+    dive = lose("lake", case, 7, imu=False)
+    assert dive is not None
+    assert follow(dive) <= WITHIN_S
+
+
+def test_in_murky_water_a_lamp_is_seen_from_a_share_of_the_range() -> None:
+    murky = Murky("basin", range_max_m=10.0)
+    on_axis = np.array((0.0, 0.0, 1.0))
+    for share, seen in ((0.95, True), (1.0, False)):
+        far_m = share * SEEN_SHARE * murky.far_m * on_axis
+        lamp = Lamp(far_m, -on_axis, np.zeros(2), 1.0, math.radians(12.0))
+        assert stands_out(lamp, murky.water, SCALE_PX) is seen
+    assert murky.water.ambient == Scenario("basin").water.ambient
+
+
+def test_a_dive_that_loses_its_fix_says_why_and_its_divers_stay() -> None:
+    found = fade(DIVES[0], "lake", 20002, imu=False, turn_degps=TURN_DEGPS)
     assert found is not None
-    assert found <= WITHIN_S
+    dive, why = found
+    assert why == "looks away"
+    t_s = (dive.now_ns - START_NS) / S_NS
+    assert "looks away" in missing(Scene(dive.scenario, dive.motion), t_s)
+    before, now = (dive.base.placement(0, t_s + later_s) for later_s in (0.0, 5.0))
+    assert np.linalg.norm(now.position_ned_m - before.position_ned_m) < 0.01
+    # Nobody comes back by himself.
+    assert follow(dive) <= WITHIN_S
+
+
+def test_a_lamp_that_is_put_out_is_dark_until_it_is_lit() -> None:
+    dive = SteeredDive(Scenario("cavern", interruptions=False), imu=False)
+
+    def seen() -> list[str]:
+        return missing(Scene(dive.scenario, dive.motion), 1.0)
+
+    assert seen() == []
+    dive.put_out("b.left")
+    assert seen() == ["dead lamp"]
+    dive.put_out()
+    assert seen() == []
