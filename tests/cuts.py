@@ -10,6 +10,7 @@ carries nothing any more. A tab is frozen by holding its thread. The screen is f
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import statistics
 import sys
@@ -36,8 +37,8 @@ CUTS = ("monitor", "solver", "b", "hub", "network", "tab")
 HELD_S = 6.0
 
 
-def time_cuts(cuts: list[str], times: int) -> dict[str, list[float]]:
-    """Return the seconds from each cut to the end of green."""
+def time_cuts(cuts: list[str], times: int) -> dict[str, list[tuple[float, float]]]:
+    """Return the seconds from each cut to the end of green, and the machine's load (of a minute) then."""
     endpoint, port = f"tcp/127.0.0.1:{free_port()}", free_port()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -60,14 +61,14 @@ def time_cuts(cuts: list[str], times: int) -> dict[str, list[float]]:
             "network": (line.cut, line.mend),
             "tab": (lambda: hold(seen, HELD_S), lambda: None),
         }
-        taken: dict[str, list[float]] = {name: [] for name in cuts}
+        taken: dict[str, list[tuple[float, float]]] = {name: [] for name in cuts}
         for _ in range(times):
             for name in cuts:
                 cut, mend = ways[name]
                 film.wait_for_green()
                 began_s = time.time()
                 cut()
-                taken[name].append(film.wait_for_green(False) - began_s)
+                taken[name].append((film.wait_for_green(False) - began_s, os.getloadavg()[0]))
                 mend()
         return taken
 
@@ -81,10 +82,13 @@ def main() -> int:
     # A SIGTERM also ends the processes that were started.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     taken = time_cuts(args.cuts or list(CUTS), args.times)
-    print(markdown_head(("cut", "times", "green for, median s", "longest s")))
-    for name, seconds in taken.items():
-        print(markdown_row([name, len(seconds), f"{statistics.median(seconds):.2f}", f"{max(seconds):.2f}"]))
-    return int(max(map(max, taken.values())) > 2.0)
+    print(markdown_head(("cut", "times", "green for, median s", "longest s", "load then", "load, median")))
+    for name, each in taken.items():
+        (longest_s, load), (median_s, median_load) = max(each), map(statistics.median, zip(*each, strict=True))
+        print(
+            markdown_row([name, len(each), f"{median_s:.2f}", f"{longest_s:.2f}", f"{load:.0f}", f"{median_load:.0f}"])
+        )
+    return int(max(map(max, taken.values()))[0] > 2.0)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import pytest
 from buddyline.node.sim.scenario import Scenario
@@ -108,32 +108,42 @@ def looking(chromium: Any, name: str, size: str = "desk") -> Iterator[Browser]:
         page.close()
 
 
+# A screen that shows something for this long does not only flicker.
+STEADY_S: Final = 1.0
+
+
 class Film:
     """The banner as the screen shows it, filmed from outside the page: it goes on while the page's thread is held."""
 
     def __init__(self, chromium: Any, seen: Browser) -> None:
         self._clock = chromium.new_page()
         self._camera = seen.page.context.new_cdp_session(seen.page)
-        self._colour: list[int] = []
-        self._shown_s = 0.0
+        self._green: bool | None = None
+        self._shown_s = self._since_s = self._turned_s = 0.0
         self._camera.on("Page.screencastFrame", self._filmed)
-        self._camera.send("Page.startScreencast", {"format": "png", "everyNthFrame": 1})
+        # Small pictures: while one waits to be taken, others are left out.
+        small = {"maxWidth": 320, "maxHeight": 200}
+        self._camera.send("Page.startScreencast", {"format": "png", "everyNthFrame": 1, **small})
 
     def _filmed(self, frame: dict[str, Any]) -> None:
         import cv2
         import numpy as np
 
         picture = cv2.imdecode(np.frombuffer(base64.b64decode(frame["data"]), np.uint8), cv2.IMREAD_COLOR)
-        self._colour, self._shown_s = picture[20, 700].tolist(), frame["metadata"]["timestamp"]
+        # They may come in another order.
+        if frame["metadata"]["timestamp"] > self._shown_s:
+            green, self._shown_s = picture[5, 175].tolist() == WELL_BGR, frame["metadata"]["timestamp"]
+            if green != self._green:
+                self._green, self._since_s, self._turned_s = green, self._shown_s, time.monotonic()
         self._camera.send("Page.screencastFrameAck", {"sessionId": frame["sessionId"]})
 
     def wait_for_green(self, green: bool = True, timeout_s: float = PATIENCE_MS / 1e3) -> float:
-        """Wait until the screen shows that all is well, or no longer does; return since when, in s since the epoch."""
+        """Wait until the screen shows for STEADY_S that all is well, or not; return since when (epoch, s)."""
         began_s = time.monotonic()
-        while not self._colour or (self._colour == WELL_BGR) != green:
+        while self._green is not green or time.monotonic() < self._turned_s + STEADY_S:
             assert time.monotonic() < began_s + timeout_s, f"{'not' if green else 'still'} green"
             self._clock.wait_for_timeout(20)
-        return self._shown_s
+        return self._since_s
 
     def close(self) -> None:
         self._camera.detach()
