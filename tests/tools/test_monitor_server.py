@@ -185,6 +185,15 @@ class TestFrames:
             assert "7.00 m" in changed["figures"]
             assert "3.00 m" in told(other, "figures")["figures"]
 
+    def test_no_text_says_that_all_is_well_once_the_banner_does_not(self) -> None:
+        overview, viewer = filled(), Viewer(live=True)
+        health = ""
+        for step in range(60):
+            frame = viewer.frame(overview, at(29) + step * 100_000_000)
+            health = frame.get("health", health)
+            if (banner := frame.get("banner")) is not None:
+                assert (banner["level"] == "ok") == ("All is well" in health), (step, banner)
+
     def test_all_nodes_that_a_sees_are_in_the_scene(self) -> None:
         overview = filled()
         take(overview, pose(29, (0.0, 0.0, 7.0), node_b="c"), at(29))

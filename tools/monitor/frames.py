@@ -73,11 +73,14 @@ class Viewer:
             said["reset"] = True
             self._reset = False
         said |= self._new_points(picture)
+        texts = self._tick % TEXTS_EVERY == 0
         if self._tick % BANNER_EVERY == 0:
             first = findings(picture, now_ns, live=self._live)[0]
             banner = {"level": first.level, "text": sentence(first, now_ns), "advice": first.advice}
+            # Below a banner that is green no longer nothing else may say that all is well.
+            texts |= self._told.get("banner", banner)["level"] != first.level
             self._tell(said, "banner", banner)
-        if self._tick % TEXTS_EVERY == 0:
+        if texts:
             self._tell(said, "figures", panel.figures(picture, now_ns))
             self._tell(said, "health", panel.health(picture, now_ns, live=self._live))
             ends = picture.end_nodes()
