@@ -12,6 +12,7 @@ import pytest
 from tests.golden.logs import read_log
 from tests.processes import PATIENCE_S, REPOSITORY, Process, free_endpoint
 
+pytestmark = pytest.mark.slow
 EXAMPLES = REPOSITORY / "examples"
 DATA = REPOSITORY / "tests" / "data" / "golden"
 LIVE = ("09_live_poses.py", "10_warn_when_far.py")

@@ -192,7 +192,7 @@ def test_compasses_that_wander_within_seconds_give_no_wrong_track() -> None:
     assert judged.nees < 1.6
 
 
-@pytest.mark.parametrize(("dark_s", "worst_m"), [(2.0, 0.06), (5.0, 0.15)])
+@pytest.mark.parametrize(("dark_s", "worst_m"), [(2.0, 0.06), pytest.param(5.0, 0.15, marks=pytest.mark.slow)])
 def test_seconds_of_darkness(dark_s: float, worst_m: float) -> None:
     dive = make(4, replace(SHORT, seconds=14.0 + dark_s, dark_s=(8.0, 8.0 + dark_s), near_m=4.0, far_m=8.0))
     judged = score(dive, smooth(dive.records, dive.fixes, dive.stamps_ns).rows)
@@ -236,6 +236,7 @@ def test_a_track_that_began_wrong_is_replaced(dive: KnownDive) -> None:
     assert judged.covered >= 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("harm", ["nan", "doubled", "gap", "stops", "no attitude", "no depth"])
 def test_bad_input_costs_little(dive: KnownDive, harm: str) -> None:
     a, b = dive.records
@@ -441,6 +442,7 @@ def test_clocks_more_than_half_a_second_apart(clock_s: float) -> None:
         assert abs(result.clock_offset_s - clock_s) < 0.02 or judged.rows == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 3, 4])
 def test_a_live_track_of_clocks_half_a_second_apart_is_not_told(seed: int) -> None:
     dive = make(seed, replace(SHORT, seconds=14.0, clock_s=0.5))
