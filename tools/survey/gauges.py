@@ -69,7 +69,7 @@ def adjust_gauges(legs: Sequence[Leg], limits: AlarmSettings | None = None) -> G
 def tides_of(legs: Sequence[Leg]) -> list[int]:
     """Return the dives whose gauges' readings show a tide."""
     readings = readings_of(legs)
-    return _with_tides(readings)[0] if readings else []
+    return _with_tides(readings)[0] if _revisiting(readings) else []
 
 
 def _with_tides(readings: Sequence[DepthReading]) -> tuple[list[int], Solution]:

@@ -142,11 +142,11 @@ def adjust(project: Project) -> Adjusted:
     covariances = solution.station_covariances
     if project.adjust.datum == "free" and not project.fix:
         covariances = free_covariances(solution, turned=survey.north_along is not None)
-    origin_m = survey.origin_m
+    position_m = solution.position_m + survey.origin_m
     at = solution.observations.at
     of_points = {ends[1]: leg.to for leg, ends in zip(survey.legs, survey.ends, strict=True) if " " in ends[1]}
     every = {
-        name: Position(of_points.get(name, name), solution.position_m[number] + origin_m, covariances[number])
+        name: Position(of_points.get(name, name), position_m[number], covariances[number])
         for name, number in at.items()
     }
     return Adjusted(

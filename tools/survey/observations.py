@@ -15,7 +15,7 @@ from buddyline.tools.survey.normal import Normal
 # distance, azimuth, inclination: of the line from start to end. east, north, up: of station `start`. rise: of end over
 # start. angle, number: of the instruments' unknowns alone.
 Kind: TypeAlias = Literal["distance", "azimuth", "inclination", "rise", "east", "north", "up", "angle", "number"]
-KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
+KINDS: Final[dict[Kind, int]] = {kind: number for number, kind in enumerate(get_args(Kind))}
 DISTANCE, _AZIMUTH, _INCLINATION, _RISE, _EAST, _NORTH, _UP, _ANGLE, _NUMBER = range(len(KINDS))
 ANGLES: Final = (_AZIMUTH, _INCLINATION, _ANGLE)
 # An iteration that moves nothing by more than this (m, rad) is the last.
@@ -108,7 +108,7 @@ class Observations:
     ) -> int:
         """Add an observation; return its row."""
         row = len(self.value)
-        self.kind.append(KINDS.index(kind))
+        self.kind.append(KINDS[kind])
         self.start.append(start)
         self.end.append(end)
         self.value.append(value)

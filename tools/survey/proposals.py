@@ -62,13 +62,13 @@ def proposals(solution: Solution, lines: Sequence[tuple[str, str]]) -> list[Prop
     for start, end in ends.tolist():
         beside[start].add(end)
         beside[end].add(start)
-    up_sd = np.sqrt(covariances[:, 2, 2] + HELD_M**2)
+    up_sd, places = np.sqrt(covariances[:, 2, 2] + HELD_M**2).tolist(), P.tolist()
     found = []
     # Their common error is not taken off here, so this is a wide gate for the heights.
     pairs = [
-        (math.dist(P[i], P[j]), i, j)
+        (math.dist(places[i], places[j]), i, j)
         for i, j in _near(P, LEG_SHARE * shortest_m)
-        if abs(float(P[i, 2] - P[j, 2])) < NEAR_SIGMAS * math.hypot(up_sd[i], up_sd[j])
+        if abs(places[i][2] - places[j][2]) < NEAR_SIGMAS * math.hypot(up_sd[i], up_sd[j])
         and not any(beside[one] & beside[j] for one in beside[i])
     ]
     pairs = sorted(pairs)[:MOST_PAIRS]
@@ -93,10 +93,11 @@ def proposals(solution: Solution, lines: Sequence[tuple[str, str]]) -> list[Prop
 def _near(P: Floats, reach_m: Floats) -> Iterator[tuple[int, int]]:
     """Yield pairs i > j of places that are nearer to each other on the map than the lesser of their reaches."""
     cell_m = max(float(reach_m.max()), 1e-3) if len(reach_m) else 1.0
+    places, reaches_m = P[:, :2].tolist(), reach_m.tolist()
     cells: dict[tuple[int, int], list[int]] = {}
     for i, (x, y) in enumerate(np.floor(P[:, :2] / cell_m).astype(int).tolist()):
         for other in ((x + dx, y + dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)):
             for j in cells.get(other, ()):
-                if math.dist(P[i, :2], P[j, :2]) < min(reach_m[i], reach_m[j]):
+                if math.dist(places[i], places[j]) < min(reaches_m[i], reaches_m[j]):
                     yield i, j
         cells.setdefault((x, y), []).append(i)
