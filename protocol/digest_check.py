@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from bisect import bisect_left, bisect_right
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal, NamedTuple
@@ -101,6 +101,10 @@ class Checked:
     # Of what the node said then, by its clock, a digest is there: begins and ends, apart and in order.
     covered: list[tuple[int, int]] = field(default_factory=list)
     due: list[_Due] = field(default_factory=list)
+    # By topic: first and last stamps of stretches that were incomplete when they were judged.
+    incomplete: dict[str, deque[tuple[int, int]]] = field(
+        default_factory=lambda: defaultdict(lambda: deque(maxlen=MAX_COVERED))
+    )
     # By topic: the checksum of the newest stretch that was right.
     right: dict[str, str] = field(default_factory=dict)
 
@@ -226,6 +230,8 @@ class DigestCheck:
             altered = _in_digests(of, one.stamp_ns, one.stamp_ns + SAID_NS)
             if topic in SAID_AGAIN:
                 altered = altered and _in_digests(of, max(one.stamp_ns, one.time_ns - SAID_NS), one.time_ns)
+            # What came after its digest was judged belongs to what was missing then, and is as little verified.
+            altered = altered and not any(first <= one.stamp_ns <= last for first, last in of.incomplete[topic])
             altered = altered and not any(-SAID_NS <= one.stamp_ns - end_ns <= MOST_DIGEST_NS for end_ns in ends_ns)
             seconds[one.time_ns // S_NS, "altered" if altered or is_whole else "unsigned"] += 1
         for (second, kind), count in sorted(seconds.items()):
@@ -314,6 +320,7 @@ def _compare(node: str, of: Checked, digest: Digest, stretch: Said) -> Iterator[
     if sum_of([one.sha256 for one in by_stamp]) == stretch.sha256:
         words = f"{stretch.topic}: {'in another order' if len(inside) == len(distinct) else 'some stand twice'}"
     elif len(distinct) < stretch.count:
+        of.incomplete[stretch.topic].append((stretch.first_ns, stretch.last_ns))
         kind, words = "missing", f"{stretch.topic}: {stretch.count - len(distinct)} of {stretch.count} are missing"
     else:
         words = f"{stretch.topic}: other messages than the node's"

@@ -11,7 +11,7 @@ from buddyline.protocol import digest_check as module
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.codec import encode, payload_stamp_ns
 from buddyline.protocol.digest import DigestBook, sealed, unsealed
-from buddyline.protocol.digest_check import DigestCheck, Discrepancy
+from buddyline.protocol.digest_check import LATE_NS, DigestCheck, Discrepancy
 from buddyline.protocol.messages import Attitude, Depth, Digest, Message, Said
 from buddyline.protocol.signing import Signer, Trust
 from buddyline.protocol.topics import DIGEST, INFO, key_of, topic_of
@@ -258,6 +258,18 @@ def test_what_a_killed_run_said_last_is_no_forgery_once_the_next_run_signs(keys:
             one for one in findings([*killed, *again, forged_at(at_ns)], keys, own=False) if one.kind == "altered"
         ]
         assert [one.words for one in altered_ones] == ["depth: 1 that are in no digest"]
+
+
+def test_messages_that_come_long_after_their_digest_are_no_forgery(keys: Path) -> None:
+    """A recorder that joins late takes a digest from the node's log, and has fetched its messages over the bus."""
+    lines = written("a", keys)
+    at = next(index for index, line in enumerate(lines) if line[0].endswith("/digest") and index > len(lines) // 2)
+    before = max(index for index in range(at) if lines[index][0].endswith("/digest"))
+    late = [(key, payload, lines[-1][2] + LATE_NS + k) for k, (key, payload, _) in enumerate(lines[before + 1 : at])]
+    found = findings([*lines[: before + 1], *lines[at:], *late], keys, own=False)
+    assert kinds(found) == {"missing", "unsigned"}
+    forged = forged_at(lines[before - 2][2])
+    assert "altered" in kinds(findings([*lines[: before + 1], *lines[at:], *late, forged], keys, own=False))
 
 
 def test_a_run_of_which_no_digest_is_there_is_no_forgery_once_the_next_run_signs(keys: Path) -> None:
