@@ -39,9 +39,11 @@ CLOCK_ROUNDS: Final = 4
 LEAST_EARLIER_S: Final = 0.15
 # An offset differs from the assumed one where it is so many sigmas off.
 TOLD_SIGMAS: Final = 6.0
-# Offsets that are tried where a first pass gives more than one track; a pass finds one up to 0.3 s from each. There is
-# no result if the best pass is in pieces: tracks whose offsets differ by more than so many s, and so many sigmas.
+# Offsets that are tried where a first pass gives more than one track, and none goes on for NEARLY_ALL of the time; a
+# pass finds one up to 0.3 s from each. There is no result if the best pass is in pieces: tracks whose offsets differ by
+# more than so many s, and so many sigmas.
 CLOCK_TRIES_S: Final = (0.4, -0.4, 0.8, -0.8)
+NEARLY_ALL: Final = 0.9
 PIECES_S: Final = 0.1
 PIECES_SIGMAS: Final = 4.0
 # Two quartz clocks drift apart by less, s a second.
@@ -255,15 +257,31 @@ def _first_pass(
 ) -> tuple[TrackFilter, list[Estimate], int]:
     """Give a filter that has passed over a dive up to stop_ns, its tracks, and how far B's clock was believed ahead.
 
-    Where that gives more than one track other offsets are tried, and the one that explains most is taken.
+    Where that gives tracks in pieces other offsets are tried, and the one that explains most is taken.
     """
     best = _rounds(records, fixes, clock_ns, stop_ns)
     for try_s in CLOCK_TRIES_S:
-        if len(best[1]) < 2:
+        if goes_on(best[1]):
             break
         other = _rounds(records, fixes, clock_ns + round(try_s * 1e9), stop_ns)
         best = max(best, other, key=lambda found: sum(part.evidence for part in found[1]))
     return best
+
+
+def goes_on(parts: Sequence[Estimate]) -> bool:
+    """Whether one of a dive's tracks is nearly all of it, with the clocks' offset settled: the others are false starts.
+
+    With a wrong offset tracks last for seconds.
+    """
+    if len(parts) < 2:
+        return True
+    longest = max(parts, key=_lasted_s)
+    whole_s = max(part.t_s for part in parts) - min(part.start_s for part in parts)
+    return _lasted_s(longest) > NEARLY_ALL * whole_s and not _clock_left_ns([longest])
+
+
+def _lasted_s(part: Estimate) -> float:
+    return min(part.t_s, part.end_s) - part.start_s
 
 
 def in_pieces(parts: Sequence[Estimate]) -> bool:

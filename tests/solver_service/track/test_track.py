@@ -15,6 +15,7 @@ from buddyline.solver_service.track.association import weigh
 from buddyline.solver_service.track.dive import (
     NodeRecord,
     Records,
+    goes_on,
     in_pieces,
     last_ns,
     of_one_clock,
@@ -383,6 +384,33 @@ def test_tracks_that_disagree_on_the_clocks_are_in_pieces(
     [part] = parts_of(first)
     parts = [replace(part, state=replace(part.state, clock_s=clock_s)) for clock_s in parts_clock_s]
     assert in_pieces(parts) is expected
+
+
+@pytest.mark.parametrize(
+    ("parts_s", "expected"),
+    [
+        ([], True),
+        ([(0.0, 4.0, 0.02)], True),
+        # A false start, and the rest of the dive: no other offset of the clocks is worth a try.
+        ([(0.0, 1.3, 0.02), (1.2, 60.0, 0.001)], True),
+        ([(0.0, 1.3, 0.0), (1.2, 60.0, 0.05)], False),
+        ([(0.0, 15.0, 0.0), (15.0, 60.0, 0.0)], False),
+    ],
+)
+def test_a_track_of_nearly_all_of_a_dive_goes_on(
+    dive: KnownDive, parts_s: list[tuple[float, float, float]], expected: bool
+) -> None:
+    first = filter_of(dive.records, dive.fixes)
+    first.advance(dive.stamps_ns[0] + 3_000_000_000)
+    [part] = parts_of(first)
+    parts = [
+        replace(part, start_s=start_s, t_s=end_s + 0.5, end_s=end_s, state=replace(part.state, clock_s=clock_s))
+        for start_s, end_s, clock_s in parts_s
+    ]
+    for one in parts:
+        one.covariance = one.covariance.copy()
+        one.covariance[CLOCK, CLOCK] = 0.001**2
+    assert goes_on(parts) is expected
 
 
 @pytest.mark.parametrize(
