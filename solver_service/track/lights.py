@@ -24,7 +24,8 @@ def light_positions(
 ) -> tuple[Floats, Floats]:
     """Give the other node's lights (L, 3) in the observer's camera frame at times dt_s (K,) after the state's.
 
-    Returns X (K, L, 3) and D (K, L, 3, NAV + 1): dX by the errors of COLUMNS. rates_radps (2, 3): turn rates.
+    Returns X (K, L, 3) and D (K, L, 3, NAV + 1): dX by the errors of COLUMNS. rates_radps (2, 3): turn rates. Where all
+    times are one, or there is none, K is 1.
     Seen by A:  X = R_A^T (r + R_B l)
                 dX = R_A^T (dr + dt dv - [r + R_B l]x (phi_B - phi_A)) + R_A^T (v + R_B (w_B x l)) dclock
     Seen by B:  X = R_B^T d, d = R_A l - r
@@ -57,9 +58,6 @@ def light_positions(
     D[..., 9:12] = -D[..., 6:9]
     clock = state.v_mps + swept if observer == 0 else -swept
     D[..., NAV] = (toward @ clock[..., None])[..., 0]
-    if alike:
-        K = len(dt_s)
-        X, D = np.broadcast_to(X, (K, *X.shape[1:])), np.broadcast_to(D, (K, *D.shape[1:]))
     return X, D
 
 
@@ -73,13 +71,14 @@ def turns_over(rate_radps: Floats, times_s: Floats) -> Floats:
 def residuals(bearings: Floats, tangents: Floats, X: Floats, D: Floats) -> tuple[Floats, Floats]:
     """Give how far each candidate (K) stands off each light (L), in px (K, L, 2), and the light's Jacobian.
 
-    bearings (K, 3), tangents (K, 2, 3): of the candidates, as Camera.rays gives them. The picture near a candidate is
+    bearings (K, 3), tangents (K, 2, 3): of the candidates, as Camera.rays gives them. X (K or 1, L, 3), D (K or 1, L,
+    3, C): the lights, as `light_positions` gives them. The picture near a candidate is
     its tangent plane: h = T X / (b . X), dh = (T - h b^T) dX / (b . X); y = -h. Infinite behind the camera.
     """
-    depth = np.einsum("kc,klc->kl", bearings, X)
+    depth = (X @ bearings[:, :, None])[..., 0]
     ahead = depth > 1e-3 * np.sqrt((X * X).sum(-1))
     safe = np.where(ahead, depth, 1.0)
-    h = np.einsum("krc,klc->klr", tangents, X) / safe[..., None]
+    h = X @ np.swapaxes(tangents, 1, 2) / safe[..., None]
     slope = (tangents[:, None] - h[..., None] * bearings[:, None, None, :]) / safe[..., None, None]
     H = slope @ D
     y = np.where(ahead[..., None], -h, np.inf)

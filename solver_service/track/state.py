@@ -29,10 +29,11 @@ NAV: Final = 12
 MOVING: Final = 21
 """The first errors, which a step moves; the others are constants or walk slowly."""
 
-# The shapes of a state's fields, where each ends in a row, and how long a row is.
+# The shapes of a state's fields, where each ends in a row, all of that for each field, and how long a row is.
 _SHAPES: Final = ((3,), (3,), (2, 3, 3), (2, 3), (3,), (2, 3), (2, 3), (2, 3), (2, 3), (2,), (), ())
-_ENDS: Final = np.cumsum([math.prod(shape) for shape in _SHAPES])
-ROW: Final = int(_ENDS[-1])
+_ENDS: Final = np.cumsum([math.prod(shape) for shape in _SHAPES]).tolist()
+_PARTS: Final = list(zip([0, *_ENDS], _ENDS, _SHAPES, strict=False))
+ROW: Final = _ENDS[-1]
 _THREE: Final = 3.0 * np.eye(3)
 _OF_PLACE: Final = np.r_[R_, PHI[0], PHI[1]]
 _PLACE: Final = np.ix_(_OF_PLACE, _OF_PLACE)
@@ -72,11 +73,11 @@ class State:
         leave open stays on its circle, however large it is (docs/track.md, consistency).
         """
         psi = error[PHI[1]] - error[PHI[0]]
-        turn = rotation_exp(np.stack((error[PHI[0]], psi)))
+        turn = rotation_exp(np.array((error[PHI[0]], psi)))
         return State(
             r_m=turn[0] @ (turn[1] @ self.r_m + left_jacobian(psi) @ error[R_]),
             v_mps=turn[0] @ (self.v_mps + error[V_]),
-            R=orthonormal(turn[0] @ np.stack((self.R[0], turn[1] @ self.R[1]))),
+            R=orthonormal(turn[0] @ np.array((self.R[0], turn[1] @ self.R[1]))),
             shake_rad=self.shake_rad + error[12:18].reshape(2, 3),
             shove_mps=turn[0] @ (self.shove_mps + error[SHOVE]),
             gyro_bias_radps=self.gyro_bias_radps + error[21:27].reshape(2, 3),
@@ -116,9 +117,8 @@ class State:
     @classmethod
     def of_row(cls, rows: Floats) -> State:
         """Return the state of a row, or the batch of rows (..., ROW)."""
-        parts = np.split(rows, _ENDS[:-1], axis=-1)
         lead = rows.shape[:-1]
-        shaped = [part.reshape((*lead, *shape)) for part, shape in zip(parts, _SHAPES, strict=True)]
+        shaped = [rows[..., start:end].reshape((*lead, *shape)) for start, end, shape in _PARTS]
         return cls(*(part if part.ndim else float(part) for part in shaped))  # type: ignore[arg-type]
 
     def moved(self, r_m: Floats, v_mps: Floats, R: Floats) -> State:

@@ -315,8 +315,7 @@ class TrackSteps(TrackIntake):
         if wide:
             inside = [True, True]
         else:
-            at = X[0] if len(X) else self._expected(estimate, observer)
-            inside = [in_picture(camera, pixel_of(camera, at[light]), EDGE_PX) for light in (0, 1)]
+            inside = [in_picture(camera, pixel_of(camera, X[0, light]), EDGE_PX) for light in (0, 1)]
             detection = detection * np.where(inside, 1.0, 0.02)
         clutter = sight.clutter / camera.area_px2
         guide = self.guides.get((observer, sight.stamp_ns))
@@ -354,17 +353,11 @@ class TrackSteps(TrackIntake):
     def _compared(
         self, sight: Sight, state: State, rates_radps: Floats, after_s: float
     ) -> tuple[Floats, Floats, Floats]:
-        """Give the lights in the camera frame (K, 2, 3) of a picture after_s after a state, residuals and Jacobians."""
+        """Give the lights, camera frame, of a picture after_s after a state, residuals and Jacobians: see `residuals`."""
         lights_m = self.nodes[1 - sight.node].rig.lights_m
         X, D = light_positions(state, sight.node, lights_m, rates_radps, sight.dt_s + after_s)
         y, H = residuals(sight.bearings, sight.tangents, X, D)
         return X, y, H
-
-    def _expected(self, estimate: Estimate, observer: int) -> Floats:
-        lights_m = self.nodes[1 - observer].rig.lights_m
-        X, _ = light_positions(estimate.state, observer, lights_m, estimate.rates_radps, np.zeros(1))
-        at: Floats = X[0]
-        return at
 
     def _without(self, guide: PassGuide, sight: Sight) -> tuple[Floats, Floats, Floats]:
         """Give residuals, Jacobians and covariance by all the dive but this picture.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -51,7 +52,8 @@ PACK = 128
 _UPPER, _MOVING_UPPER = np.triu_indices(SIZE), np.triu_indices(MOVING)
 _HALVES = (len(_UPPER[0]),), (len(_MOVING_UPPER[0]),)
 _SHAPES = ((), (), (), (2, 3), (ROW,), (ROW,), *_HALVES, (MOVING, SIZE), (SIZE - MOVING,))
-_ENDS = np.cumsum([int(np.prod(shape)) for shape in _SHAPES])
+_ENDS = np.cumsum([math.prod(shape) for shape in _SHAPES]).tolist()
+_PARTS = list(zip([0, *_ENDS], _ENDS, _SHAPES, strict=False))
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,9 +89,8 @@ def _row_of(step: Step) -> Floats:
 
 
 def _step_of(row: Floats, looks: tuple[Look, ...]) -> Step:
-    parts = np.split(row, _ENDS[:-1])
     t_s, light_s, lights, rates, before, after, half, of_Q, F, walk = (
-        part.reshape(shape) for part, shape in zip(parts, _SHAPES, strict=True)
+        row[start:end].reshape(shape) for start, end, shape in _PARTS
     )
     covariance = np.empty((SIZE, SIZE))
     covariance[_UPPER] = covariance.T[_UPPER] = half
