@@ -271,7 +271,7 @@ def _first_pass(
 def goes_on(parts: Sequence[Estimate]) -> bool:
     """Whether one of a dive's tracks is nearly all of it, with the clocks' offset settled: the others are false starts.
 
-    With a wrong offset tracks last for seconds.
+    With a wrong offset tracks are replaced after seconds, or go on but ask for another offset in each pass.
     """
     if len(parts) < 2:
         return True
