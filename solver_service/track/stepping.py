@@ -353,7 +353,7 @@ class TrackSteps(TrackIntake):
     def _compared(
         self, sight: Sight, state: State, rates_radps: Floats, after_s: float
     ) -> tuple[Floats, Floats, Floats]:
-        """Give the lights, camera frame, of a picture after_s after a state, residuals and Jacobians: see `residuals`."""
+        """Give the lights (camera frame), residuals and Jacobians of a picture after_s after a state."""
         lights_m = self.nodes[1 - sight.node].rig.lights_m
         X, D = light_positions(state, sight.node, lights_m, rates_radps, sight.dt_s + after_s)
         y, H = residuals(sight.bearings, sight.tangents, X, D)
