@@ -29,8 +29,13 @@ PAGES: Final = {
     "Build and survey": ["docs/build/README.md", "node/README.md", "docs/pool_day.md", "tools/survey/README.md"],
     "Reference": ["commands", "messages", "docs/glossary.md"],
     "How it works": [
-        "docs/theory.md", "docs/node.md", "docs/track.md", "docs/network.md", "docs/geodesy.md", "docs/decisions.md",
-    ],  # fmt: skip
+        "docs/theory.md",
+        "docs/node.md",
+        "docs/track.md",
+        "docs/network.md",
+        "docs/geodesy.md",
+        "docs/decisions.md",
+    ],
     "Develop": ["CONTRIBUTING.md", "CHANGELOG.md"],
 }
 LINK: Final = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s#]+)(#[^)\s]*)?\)")
