@@ -33,6 +33,7 @@ from buddyline.solver_service.track.state import (
     NAV,
     PHI,
     R_,
+    SHAKE,
     SIZE,
     V_,
     State,
@@ -46,6 +47,7 @@ from buddyline.solver_service.track.strapdown import (
     SampleGrid,
     guessed_noise,
     integrate,
+    kept_shares,
     moved_by_shares,
     predicted,
     process_noise,
@@ -171,19 +173,22 @@ class TrackSteps(TrackIntake):
                 noise = replace(noise, gap_accel_mps=push, gap_rate_radps=rate)
                 stated = self.turning[node].stated(t_s)
                 if stated is not None:
-                    noise = replace(noise, gap_tilt_rad=wander * stated[0], gap_heading_rad=wander * stated[1])
+                    tilt, heading = stated
+                    noise = replace(noise, tilt_rad=tilt, gap_tilt_rad=wander * tilt, gap_heading_rad=wander * heading)
             noises.append(noise)
         return noises[0], noises[1]
 
     def _move(self, estimate: Estimate, t_s: float) -> tuple[Floats, Floats, Floats]:
         span_s = t_s - estimate.t_s
         parts = self.increments(estimate, t_s)
-        after, F = propagate(estimate.state, parts, span_s)
         a, b = self._noises(estimate, t_s)
+        # Where a unit stops or comes back, its angle in the mount begins anew.
+        shares = kept_shares(parts.without, (a, b), span_s) * (parts.without == estimate.without)
+        after, F = propagate(estimate.state, parts, span_s, shares)
         noises = self._startled(estimate, after, F, 0, a, t_s), self._startled(estimate, after, F, 1, b, t_s)
         learned = estimate.shaking.variances
         shaking = self._with_sudden(learned, parts.sudden_rad)
-        Q, walk, shaken = process_noise(after, parts, noises, shaking, span_s)
+        Q, walk, shaken = process_noise(after, parts, noises, shaking, span_s, shares)
         onward = F[:, :MOVING]
         estimate.shaken = onward @ estimate.shaken @ onward.T + (learned / shaking)[:, None, None] * shaken
         if parts.by_fast is not None:
@@ -192,8 +197,8 @@ class TrackSteps(TrackIntake):
             estimate.by_shares = by_shares
         without_a, without_b = parts.without.tolist()
         if self._follows_walk(estimate):
-            guessed = self._guessed(after, parts, (a, b), noises, span_s)
-            estimate.walking = estimate.walking.stepped(F, walk, (not without_a, not without_b), guessed)
+            guessed, moved = self._guessed(estimate, after, F, parts, (a, b), noises, span_s, shares)
+            estimate.walking = estimate.walking.stepped(F, walk, (not without_a, not without_b), guessed, moved)
         for node, without in enumerate((without_a, without_b)):
             if without != estimate.without[node]:
                 # The unit has stopped, or come back: its constants and what stands in their place are told anew.
@@ -214,21 +219,40 @@ class TrackSteps(TrackIntake):
 
     @staticmethod
     def _guessed(
+        estimate: Estimate,
         after: State,
+        F: Floats,
         parts: Increments,
         noises: tuple[Noise, Noise],
         taken: tuple[Noise, Noise],
         span_s: float,
-    ) -> Floats | None:
-        """Give what the learned walks of nodes without units add in a step; of a sudden turn, nothing is learned."""
+        shares: Floats,
+    ) -> tuple[Floats | None, Floats]:
+        """Give what a step adds to the derivatives by the walks of nodes without units: of covariance and state.
+
+        Of a sudden turn, nothing is learned. Of a tilt error q that decays, q1 = k q0 + n, var n = s^2 (1 - k^2), the
+        logarithm of k is minus a number times the walk's variance: dk = k ln k, dvar n = -2 k^2 ln k s^2 dlog.
+        """
+        drift = np.zeros(SIZE)
         if not parts.without.any():
-            return None
-        guessed = guessed_noise(parts, noises, span_s)
+            return None, drift
+        guessed = guessed_noise(parts, noises, span_s, shares)
         if taken != noises:
             guessed[1] = 0.0
+        for node in (0, 1):
+            if parts.without[node]:
+                k = float(shares[node])
+                log_k = math.log(k) if k > 0.0 else 0.0
+                guessed[2, SHAKE[node], SHAKE[node]] *= -2.0 * k * k * log_k / max(1.0 - k * k, 1e-12)
+                drift[SHAKE[node]] = log_k
         T = invariant_of_plain(after)
         guessed[:, :MOVING, :MOVING] = T @ guessed[:, :MOVING, :MOVING] @ T.T
-        return guessed
+        onward = predicted(estimate.covariance, F, np.zeros((MOVING, MOVING)), np.zeros(SIZE - MOVING))
+        less = drift[:, None] * onward
+        guessed[2] += less + less.T
+        for node in (0, 1):
+            drift[SHAKE[node]] *= after.shake_rad[node]
+        return guessed, drift
 
     def _startled(self, estimate: Estimate, after: State, F: Floats, node: int, noise: Noise, to_s: float) -> Noise:
         """Return the noise of a step to to_s; more of it where a node without a unit turns otherwise than it did.
@@ -239,8 +263,8 @@ class TrackSteps(TrackIntake):
         if near is None:
             return noise
         R_level_camera, variances = near
-        y = anchors.attitude_residual(after, node, R_level_camera)[0] - after.mount_rad[node]
-        H = F[PHI[node]].copy()
+        y = anchors.attitude_residual(after, node, R_level_camera)[0] - after.mount_rad[node] - after.shake_rad[node]
+        H = F[PHI[node]] + F[SHAKE[node]]
         H[:, MOUNT[node]] += np.eye(3)
         span_s = to_s - estimate.t_s
         walks = (noise.gap_tilt_rad, noise.gap_tilt_rad, noise.gap_heading_rad)
@@ -478,8 +502,8 @@ class TrackSteps(TrackIntake):
                 continue
             R_level_camera, variances = near
             y, H = anchors.attitude_residual(estimate.state, node, R_level_camera)
-            y = y - estimate.state.mount_rad[node]
-            H[:, MOUNT[node]] = np.eye(3)
+            y = y - estimate.state.mount_rad[node] - estimate.state.shake_rad[node]
+            H[:, MOUNT[node]] = H[:, SHAKE[node]] = np.eye(3)
             noise = (R_level_camera * variances) @ R_level_camera.T
             S = noise + (H @ estimate.covariance @ H.T)
             if float(y @ np.linalg.solve(S, y)) < 30.0:
@@ -500,9 +524,11 @@ class TrackSteps(TrackIntake):
         if span_s <= least_s:
             return estimate.state, estimate.covariance
         parts = self.increments(estimate, t_s) if parts is None else parts
-        after, F = propagate(estimate.state, parts, span_s)
+        noises = self._noises(estimate, t_s)
+        shares = kept_shares(parts.without, noises, span_s) * (parts.without == estimate.without)
+        after, F = propagate(estimate.state, parts, span_s, shares)
         shaking = self._with_sudden(estimate.shaking.variances, parts.sudden_rad)
-        Q, walk, _ = process_noise(after, parts, self._noises(estimate, t_s), shaking, span_s)
+        Q, walk, _ = process_noise(after, parts, noises, shaking, span_s, shares)
         return after, predicted(estimate.covariance, F, Q, walk)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Final, Protocol, TypeAlias
 
@@ -44,8 +45,9 @@ class Noise:
     gyro_rad, accel_mps: of the samples. gap_gyro_rad, gap_accel_mps: of the motion that no sample tells;
     gap_rate_radps, gap_tilt_rad, gap_heading_rad: without a unit, of the turn rate, which stands in place of the
     gyro's bias, and of the attitude filter's own error, which stands in place of the mount (by its stated sigmas,
-    where it states any). gyro_bias_radps, accel_bias_mps2: of the biases' walk. A pair's track has learned walks, of
-    the biases and without units (walking.py), the network these.
+    where it states any); tilt_rad: the sigma of its tilt, which a pair's track lets it not exceed (`kept_shares`).
+    gyro_bias_radps, accel_bias_mps2: of the biases' walk. A pair's track has learned walks, of the biases and without
+    units (walking.py), the network these.
     """
 
     gyro_rad: float
@@ -55,6 +57,7 @@ class Noise:
     gap_rate_radps: float = 0.15
     gap_tilt_rad: float = 0.03
     gap_heading_rad: float = 0.012
+    tilt_rad: float = 0.03
     gyro_bias_radps: float = 2.5e-4
     accel_bias_mps2: float = 4e-3
 
@@ -254,27 +257,39 @@ def integrate(state: Carried, grid: SampleGrid) -> Increments:
     )
 
 
-def propagate(state: State, parts: Increments, span_s: float) -> tuple[State, Floats]:
+def kept_shares(without: Bools, noises: tuple[Noise, Noise], span_s: float) -> Floats:
+    """Give the shares (2,) of the units' angles in their mounts that are left after a step.
+
+    Where there is no unit, the angle is how far an attitude filter's tilt is off. It changes within seconds, but stays
+    as large as stated: it decays as fast as fits its walk, with the time constant 2 tilt^2 / walk^2.
+    """
+    swings = [math.exp(-0.5 * span_s * (noise.gap_tilt_rad / max(noise.tilt_rad, 1e-9)) ** 2) for noise in noises]
+    return np.where(without, swings, kept_share(span_s))
+
+
+def propagate(state: State, parts: Increments, span_s: float, shares: Floats | None = None) -> tuple[State, Floats]:
     """Move the state by both nodes' increments; return it and the rows (MOVING, SIZE) of its transition that are not 1.
 
     The errors are those of `State.plus`, at both ends. What the units were shaken by at the start is in the increments;
-    a share of it is still there at the end (shaking.py).
+    a share of it is still there at the end (shaking.py). shares (2,): of the angles, as `kept_shares` gives them; 0
+    where an angle has nothing to do with what it was. By default both nodes have a unit.
     """
     kept = kept_share(span_s)
+    kept_angle = np.full(2, kept) if shares is None else shares
     dv, dp = parts.dv_mps[1] - parts.dv_mps[0], parts.dp_m[1] - parts.dp_m[0]
     gone, back_s = 1.0 - kept, span_s - SHAKEN_S * (1.0 - kept)
     # Without a unit nothing is shaken.
-    felt = (~parts.without).astype(np.float64)
+    felt = (~parts.without & (kept_angle > 0.0)).astype(np.float64)
     shake = felt[:, None] * state.shake_rad
     shove = felt.max() * state.shove_mps
     off = rotation_exp((state.R @ shake[:, :, None])[:, :, 0])
-    R = off @ parts.R @ rotation_exp(-kept * shake)
+    R = off @ parts.R @ rotation_exp(-kept_angle[:, None] * shake)
     after = replace(
         state,
         r_m=state.r_m + state.v_mps * span_s + back_s * shove + dp,
         v_mps=state.v_mps + gone * shove + dv,
         R=R,
-        shake_rad=kept * state.shake_rad,
+        shake_rad=kept_angle[:, None] * state.shake_rad,
         shove_mps=kept * state.shove_mps,
     )
     F = np.zeros((MOVING, SIZE))
@@ -285,8 +300,8 @@ def propagate(state: State, parts: Increments, span_s: float) -> tuple[State, Fl
     F[V_, SHOVE] = felt.max() * gone * _IDENTITY
     F[SHOVE, SHOVE] = kept * _IDENTITY
     for node in (0, 1):
-        F[PHI[node], SHAKE[node]] = felt[node] * (state.R[node] - kept * R[node])
-        F[SHAKE[node], SHAKE[node]] = kept * _IDENTITY
+        F[PHI[node], SHAKE[node]] = felt[node] * (state.R[node] - kept_angle[node] * R[node])
+        F[SHAKE[node], SHAKE[node]] = kept_angle[node] * _IDENTITY
     F[:, :MOVING] = F[:, :MOVING] @ plain_of_invariant(state)
     return after, invariant_of_plain(after) @ F
 
@@ -303,10 +318,11 @@ def moved_by_shares(after: State, by_fast: Floats) -> Floats:
 
 
 def process_noise(
-    after: State, parts: Increments, noises: tuple[Noise, Noise], shaking: Floats, span_s: float
+    after: State, parts: Increments, noises: tuple[Noise, Noise], shaking: Floats, span_s: float, shares: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Give what a step adds to the covariance: of the moving errors (MOVING, MOVING), and of each other error
-    (SIZE-MOVING,); and the parts in the first that shaking of the variances (3,) adds, (3, MOVING, MOVING)."""
+    (SIZE-MOVING,); and the parts in the first that shaking of the variances (3,) adds, (3, MOVING, MOVING).
+    shares (2,): as `propagate` takes them."""
     Q = np.zeros((MOVING, MOVING))
     without = parts.without.tolist()
     walk = np.zeros(SIZE)
@@ -321,7 +337,7 @@ def process_noise(
             walk[GYRO_BIAS[node]] = noise.gyro_bias_radps**2 * span_s
     _accelerated(Q, force, span_s)
     if any(without):
-        whole = guessed_noise(parts, noises, span_s).sum(axis=0)
+        whole = guessed_noise(parts, noises, span_s, shares).sum(axis=0)
         Q += whole[:MOVING, :MOVING]
         walk += np.diag(whole) * _CONSTANT
     shaken = shaking_noise(after.R, shaking, span_s)
@@ -333,10 +349,10 @@ def process_noise(
     return T @ Q @ T.T + shaken.sum(axis=0), walk[MOVING:], shaken
 
 
-def guessed_noise(parts: Increments, noises: tuple[Noise, Noise], span_s: float) -> Floats:
+def guessed_noise(parts: Increments, noises: tuple[Noise, Noise], span_s: float, shares: Floats) -> Floats:
     """Give what a step adds to the plain errors' covariance where nodes have no unit, (3, SIZE, SIZE).
 
-    By their acceleration, by their turn rates' walk, and by that of their attitudes' slow error.
+    By their acceleration, by their turn rates' walk, and by their attitudes' slow error: tilt and heading.
     """
     guessed = np.zeros((3, SIZE, SIZE))
     force = 0.0
@@ -346,8 +362,9 @@ def guessed_noise(parts: Increments, noises: tuple[Noise, Noise], span_s: float)
             rate = noise.gap_rate_radps**2 * _IDENTITY
             guessed[1, PHI[node], PHI[node]] = span_s**3 / 3.0 * rate
             guessed[1, GYRO_BIAS[node], GYRO_BIAS[node]] = span_s * rate
-            tilt, heading = noise.gap_tilt_rad**2, noise.gap_heading_rad**2
-            guessed[2, MOUNT[node], MOUNT[node]] = span_s * np.diag((tilt, tilt, heading))
+            tilted = noise.tilt_rad**2 * (1.0 - float(shares[node]) ** 2)
+            guessed[2, SHAKE[node], SHAKE[node]] = np.diag((tilted, tilted, 0.0))
+            guessed[2, MOUNT[node], MOUNT[node]] = np.diag((0.0, 0.0, span_s * noise.gap_heading_rad**2))
     _accelerated(guessed[0], force, span_s)
     return guessed
 

@@ -65,11 +65,19 @@ class Walking:
         count = followed.stop - followed.start
         return Walking(self.logs, self.information, followed, np.zeros((count, SIZE, SIZE)), np.zeros((SIZE, count)))
 
-    def stepped(self, F: Floats, walk: Floats, walking: tuple[bool, bool], guessed: Floats | None = None) -> Walking:
+    def stepped(
+        self,
+        F: Floats,
+        walk: Floats,
+        walking: tuple[bool, bool],
+        guessed: Floats | None = None,
+        drift: Floats | None = None,
+    ) -> Walking:
         """Go on by a step with the transition's rows F (MOVING, SIZE).
 
         walk (SIZE - MOVING,): the variances that the step adds to the constants. walking: which nodes have a unit.
-        guessed (3, SIZE, SIZE): what the step adds by each walk of the nodes that have none.
+        guessed (3, SIZE, SIZE): what the step adds by each walk of the nodes that have none. drift (SIZE,): how the
+        last of these moves the state.
         """
         now = self.following(walking)
         spread, moved = now.spread.copy(), now.moved.copy()
@@ -85,6 +93,8 @@ class Walking:
                     spread[k, at, at] += walk[of_node.start - MOVING : of_node.stop - MOVING]
         if guessed is not None:
             spread[-len(guessed) :] += guessed
+        if drift is not None:
+            moved[:, -1] += drift
         return replace(now, spread=spread, moved=moved)
 
     def taught(self, y: Floats, S_inverse: Floats, H: Floats, gain: Floats, *, learns: bool = True) -> Walking:

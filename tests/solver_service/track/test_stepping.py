@@ -127,7 +127,7 @@ def startled(offs: Floats) -> list[bool]:
     """Say after which attitudes of B, off their prediction by offs (N, 3) sigmas, it is taken to have begun to turn."""
     dive = make(1, Setting(seconds=1.0))
     track = TrackFilter(dive.records[0].node, dive.records[1].node)
-    state = replace(a_state(4), mount_rad=np.zeros((2, 3)))
+    state = replace(a_state(4), mount_rad=np.zeros((2, 3)), shake_rad=np.zeros((2, 3)))
     estimate = Estimate(0.0, state, np.zeros((SIZE, SIZE)), 0.0, without=[False, True])
     still = Noise(0.0, 0.0, gap_rate_radps=0.0, gap_tilt_rad=0.0, gap_heading_rad=0.0)
     F = np.eye(SIZE)[:MOVING]

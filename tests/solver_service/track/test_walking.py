@@ -8,8 +8,18 @@ import numpy as np
 import pytest
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.anchors import kalman
-from buddyline.solver_service.track.state import ACCEL_BIAS, GYRO_BIAS, MOVING, PHI, SIZE, V_
-from buddyline.solver_service.track.strapdown import predicted
+from buddyline.solver_service.track.estimate import Estimate
+from buddyline.solver_service.track.state import ACCEL_BIAS, GYRO_BIAS, MOUNT, MOVING, PHI, SHAKE, SIZE, V_, State
+from buddyline.solver_service.track.stepping import TrackSteps
+from buddyline.solver_service.track.strapdown import (
+    Increments,
+    Noise,
+    guessed_noise,
+    kept_shares,
+    predicted,
+    process_noise,
+    propagate,
+)
 from buddyline.solver_service.track.walking import FIRST, LEAST, OF_NODES, WALKS, Walking, joint
 
 STEP_S = 0.1
@@ -131,3 +141,86 @@ def test_a_nodes_own_motion_is_found_but_never_taken_for_rest(times: float) -> N
     least = np.exp(0.5 * LEAST[2]) / FIRST[2]
     assert found.densities[2] / FIRST[2] == pytest.approx(max(times, least), rel=0.2)
     assert (found.logs[:2] == Walking().logs[:2]).all()
+
+
+TILT_RAD = 0.0175
+
+
+def tilting(walking: Walking, seen: Floats, *, learns: bool) -> tuple[Walking, Floats, Floats]:
+    """Filter tilts (N, 2) of A's attitude messages, of which only the error changes; give its covariance and state."""
+    P, F_still = np.zeros((SIZE, SIZE)), np.eye(SIZE)[:MOVING]
+    P[SHAKE[0], SHAKE[0]] = np.diag((1.0, 1.0, 0.0)) * TILT_RAD**2
+    H, noise = np.eye(SIZE)[SHAKE[0]][:2], np.eye(2) * 0.005**2
+    estimate = Estimate(0.0, at_rest(), P, 0.0, without=[True, True])
+    parts = unmoved()
+    for y in seen:
+        tilt = Noise(0.0, 0.0, gap_accel_mps=0.0, gap_rate_radps=0.0, gap_heading_rad=0.0, tilt_rad=TILT_RAD)
+        noises = 2 * (replace(tilt, gap_tilt_rad=walking.densities[4] * TILT_RAD),)
+        shares = kept_shares(parts.without, noises, STEP_S)
+        F = F_still.copy()
+        F[SHAKE[0], SHAKE[0]] = F[SHAKE[1], SHAKE[1]] = shares[0] * np.eye(3)
+        after = replace(estimate.state, shake_rad=shares[:, None] * estimate.state.shake_rad)
+        guessed, drift = TrackSteps._guessed(estimate, after, F, parts, noises, noises, STEP_S, shares)
+        added = guessed_noise(parts, noises, STEP_S, shares)[2]
+        walking = walking.stepped(F, np.zeros(SIZE - MOVING), (False, False), guessed, drift)
+        P = predicted(estimate.covariance, F, added[:MOVING, :MOVING], np.zeros(SIZE - MOVING))
+        off = y - after.shake_rad[0, :2]
+        error, P, _, inverse, gain = kalman(P, H, off, noise)
+        walking = walking.taught(off, inverse, H, gain, learns=learns)
+        estimate = replace(estimate, state=after.plus(error), covariance=P)
+    return walking, estimate.covariance, estimate.state.shake_rad[0]
+
+
+def at_rest() -> State:
+    still = np.zeros((2, 3))
+    R = np.stack((np.eye(3), np.eye(3)))
+    far_m = np.array((0.0, 0.0, 5.0))
+    return State(far_m, np.zeros(3), R, still, np.zeros(3), still, still, still, still, np.zeros(2), 0.0, 0.0)
+
+
+def unmoved() -> Increments:
+    """What two nodes without a unit tell of their motion in a step: nothing."""
+    turns, three = np.stack((np.eye(3), np.eye(3))), np.zeros((2, 3))
+    both = np.ones(2, dtype=bool)
+    return Increments(turns, three, three, np.zeros((2, 9, 16)), np.full(2, STEP_S), three, None, both, np.zeros(2))
+
+
+def swinging(rng: np.random.Generator, count: int, lasts_s: float) -> Floats:
+    """Tilt errors (N, 2) of TILT_RAD that are forgotten within lasts_s, and the messages' noise."""
+    kept = np.exp(-STEP_S / lasts_s)
+    errors = rng.normal(0.0, TILT_RAD, (count, 2))
+    for k in range(1, count):
+        errors[k] = kept * errors[k - 1] + np.sqrt(1.0 - kept * kept) * errors[k]
+    return errors + rng.normal(0.0, 0.005, (count, 2))
+
+
+def test_slopes_by_a_tilts_wandering_are_those_of_differences() -> None:
+    seen = swinging(np.random.default_rng(5), 12, 0.35)
+    walking, _, _ = tilting(Walking(), seen, learns=False)
+    off = 1e-3 * np.eye(WALKS)[4]
+    ends = [tilting(Walking(Walking().logs + sign * off), seen, learns=False) for sign in (1.0, -1.0)]
+    spread, moved = ((ends[0][i] - ends[1][i]) / 2e-3 for i in (1, 2))
+    assert np.abs(walking.spread[2] - spread).max() < 1e-4 * np.abs(spread).max()
+    assert np.abs(walking.moved[SHAKE[0], 2] - moved).max() < 1e-4 * np.abs(moved).max()
+
+
+def test_how_long_a_tilts_error_lasts_is_found() -> None:
+    rng = np.random.default_rng(6)
+    for lasts_s in (0.5, 5.0):
+        found, _, _ = tilting(Walking(), swinging(rng, 3000, lasts_s), learns=True)
+        assert 2.0 / found.densities[4] ** 2 == pytest.approx(lasts_s, rel=0.3)
+
+
+def test_a_tilts_error_never_outgrows_its_stated_sigma() -> None:
+    """As a walk it was off by three of them after ten seconds, and lights a second apart were believed to share it."""
+    parts, noise = unmoved(), Noise(0.0, 0.0, gap_tilt_rad=TILT_RAD, tilt_rad=TILT_RAD)
+    P = np.zeros((SIZE, SIZE))
+    for _ in range(100):
+        shares = kept_shares(parts.without, (noise, noise), 0.1)
+        after, F = propagate(at_rest(), parts, 0.1, shares)
+        Q, walk, _ = process_noise(after, parts, (noise, noise), np.zeros(3), 0.1, shares)
+        P = predicted(P, F, Q, walk)
+    tilts = [np.diag(P[SHAKE[node], SHAKE[node]] + P[MOUNT[node], MOUNT[node]])[:2] for node in (0, 1)]
+    assert np.sqrt(tilts) == pytest.approx(np.full((2, 2), TILT_RAD), rel=1e-3)
+    heading = np.sqrt(P[MOUNT[0], MOUNT[0]][2, 2])
+    assert heading == pytest.approx(noise.gap_heading_rad * np.sqrt(10.0))
