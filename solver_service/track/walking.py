@@ -35,6 +35,7 @@ MOST: Final = 2.0 * np.log(10.0 * FIRST)
 WALKS: Final = len(FIRST)
 OF_UNITS: Final = slice(0, 2)
 OF_NODES: Final = slice(2, WALKS)
+_IDENTITY: Final = np.eye(SIZE)
 _BIASES: Final = (GYRO_BIAS, ACCEL_BIAS)
 
 
@@ -110,11 +111,12 @@ class Walking:
         across = self.spread @ H.T
         D = H @ across
         W = S_inverse @ D
-        moved = self.moved + (across @ z).T
-        moved = moved - gain @ (H @ moved)
-        # Rounding must not make it asymmetric, that part would grow: so both halves are taken off as one sum.
-        half = gain @ np.swapaxes(across - 0.5 * gain @ D, 1, 2)
-        spread = self.spread - (half + np.swapaxes(half, 1, 2))
+        rest = _IDENTITY - gain @ H
+        moved = rest @ (self.moved + (across @ z).T)
+        less = gain @ np.swapaxes(across, 1, 2)
+        spread = self.spread - less - np.swapaxes(less, 1, 2) + gain @ D @ gain.T
+        # Rounding must not make it asymmetric: that part would grow.
+        spread = 0.5 * (spread + np.swapaxes(spread, 1, 2))
         if not learns:
             return replace(self, spread=spread, moved=moved)
         y_moved = H @ self.moved
