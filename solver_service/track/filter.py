@@ -294,6 +294,9 @@ class TrackFilter(TrackPool):
         ):
             if not all(self._leads(best, rival) for rival in self.challengers):
                 return
+            for rival in self.challengers:
+                # A rival goes on as a challenger: what it is to explain better is what came since both exist.
+                rival.baseline = best.evidence - rival.evidence + lead(rival, best)
             self.main = self._again(best)
             self.main.confirmed = True
 

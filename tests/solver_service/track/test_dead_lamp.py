@@ -7,7 +7,7 @@ import pytest
 from buddyline.node.sim.dive import messages
 from buddyline.node.sim.scenario import ENVIRONMENTS, DivePlan, Scenario
 from buddyline.node.sim.world import World
-from buddyline.protocol.messages import LightTruth, NodePose, Track, Truth
+from buddyline.protocol.messages import LightTruth, NodePose, Track, TrackMode, Truth
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.track.dive import last_ns, smooth
@@ -58,10 +58,10 @@ def test_one_wrong_fix_replaces_no_track() -> None:
     assert judged.covered > 0.4
 
 
-def simulated(scenario: Scenario, seconds: float) -> tuple[int, float]:
+def simulated(scenario: Scenario, seconds: float, mode: TrackMode = "smooth") -> tuple[int, float]:
     """Solve a dive of the simulator; return how many rows are wrong, and the share of its time that is covered."""
     world = World(scenario)
-    core = SolverCore(Settings(), [("a", "b")], track=TrackSettings(frozenset(("smooth",))))
+    core = SolverCore(Settings(), [("a", "b")], track=TrackSettings(frozenset((mode,))))
     told = [
         one
         for _, _, message in messages(world, DivePlan(seconds=seconds, imu=True))
@@ -83,6 +83,15 @@ def test_a_track_that_is_replaced_and_that_no_fix_agreed_with_leaves_no_rows() -
     )
     assert wrong == 0
     assert share > 0.8
+
+
+def test_a_younger_start_that_explains_the_pictures_better_replaces_a_live_track() -> None:
+    """The older one has drifted off when it is confirmed: what it explained before the younger one began is no lead."""
+    wrong, share = simulated(
+        Scenario("night_reef", seed=2006, start_ns=EPOCH_NS, inertial="poor", dead_lamps=("a.left",)), 6.0, "filter"
+    )
+    assert wrong == 0
+    assert share > 0.3
 
 
 @pytest.mark.slow
