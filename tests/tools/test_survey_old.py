@@ -154,6 +154,39 @@ def test_the_adjustment_of_an_old_survey_is_cavern_s(tmp_path):
 
 
 @CAVERN
+@THERION
+def test_a_tape_shorter_than_its_rise_is_weighed_with_it_as_survex_does(tmp_path):
+    text = "*fix 1 0 0 0\n*sd tape 0.2 metres\n*data diving from to tape compass fromdepth todepth\n"
+    expected = by_cavern(tmp_path, text + "1 2 9.0 90 0.0 -4.0\n2 3 1.0 90 -4.0 -5.2\n3 4 0.5 0 -5.2 -4.5\n", "short")
+    old = read_old(tmp_path / "short.svx")
+    project = joined(Project(), [old])
+    adjusted, same_as = adjust(project), same_place(project, [old])
+    ours = {name: adjusted.positions[same_as(name)].position_m for name in old.stations}
+    assert_same(ours, expected, fixed=True)
+    assert_same(in_survex(tmp_path, old), expected, fixed=True)
+    assert_same(in_therion(tmp_path, old), expected, fixed=True)
+
+
+@CAVERN
+@THERION
+def test_each_leg_keeps_its_own_kind_of_north_in_therion(tmp_path):
+    text = """*cs utm33
+*cs out utm33
+*fix 1 410600 5282000 1234
+*declination auto 410600 5282000 1234
+1 2 10.00 320 -06
+*date 2012.06.25
+*declination 5 degrees
+2 3 10 000 0
+*declination auto 410600 5282000 1234
+3 4 10 090 0
+"""
+    # Without a day Survex takes no declination, but the grid's convergence.
+    expected = by_cavern(tmp_path, text, "norths")
+    assert_same(in_therion(tmp_path, read_old(tmp_path / "norths.svx")), expected, fixed=True)
+
+
+@CAVERN
 @pytest.mark.parametrize("first", ["old", "new"])
 def test_new_legs_hang_on_an_old_survey_in_one_adjustment(tmp_path, first):
     course = world.loop(np.random.default_rng(6), 12)

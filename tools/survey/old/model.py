@@ -91,6 +91,7 @@ class OldShot:
                 run_m = self.tape_m
                 if self.style == "diving":
                     run_m = math.sqrt(max(self.tape_m**2 - up_m**2, 0.0))
+                    up_m = self._plumbed_m if run_m == 0.0 else up_m
                 if self.compass_deg is None and self.back_deg is None:
                     run_m = 0.0
         return math.hypot(run_m, up_m), azimuth_deg % 360, math.degrees(math.atan2(up_m, run_m))
@@ -117,8 +118,17 @@ class OldShot:
             slope_m = distance_m * math.sqrt(0.1)
         elif self.style != "normal":
             slope_m = math.sqrt(2) * self.sigma("depth")
-        one, two, three = (math.hypot(held_m, own_m) for own_m in (self.sigma("tape"), aside_m, slope_m))
+        along_m = self.sigma("tape")
+        if self.style == "diving" and self.tape_m <= abs(self.rise_m or 0.0):
+            along_m, slope_m = along_m * slope_m / math.hypot(along_m, slope_m), 0.0
+        one, two, three = (math.hypot(held_m, own_m) for own_m in (along_m, aside_m, slope_m))
         return one, two, three
+
+    @property
+    def _plumbed_m(self) -> float:
+        """Rise (m) of a diver's shot whose tape is no longer than the depths differ: the mean of both, as in Survex."""
+        rise_m, tape_var, rise_var = self.rise_m or 0.0, self.sigma("tape") ** 2, 2 * self.sigma("depth") ** 2
+        return (rise_m * tape_var + math.copysign(self.tape_m, rise_m) * rise_var) / (tape_var + rise_var)
 
     @property
     def _azimuth_deg(self) -> float:

@@ -375,11 +375,13 @@ def _plumb(shot: OldShot) -> Literal["", "up", "down"]:
 
 
 def _th_north(shot: OldShot, state: Mapping[str, str], turn_deg: float) -> dict[str, str]:
-    if shot.style in ("nosurvey", "distance") or shot.north.kind == "model":
+    if shot.style in ("nosurvey", "distance"):
         return {}
-    # Therion itself turns from true north to the grid's.
+    if shot.north.kind == "model" and shot.when is not None:
+        return {"declination": "- degrees"} if "declination" in state else {}
+    # Therion itself turns from true north to the grid's; without a day Survex's model and ours give 0.
     value_deg = shot.north.value_deg + (turn_deg if shot.north.kind == "grid" else 0.0)
-    if value_deg or turn_deg or "declination" in state:
+    if value_deg or turn_deg or shot.north.kind == "model" or "declination" in state:
         return {"declination": f"{value_deg + 0.0:.4f} degrees"}
     return {}
 
