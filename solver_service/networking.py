@@ -16,7 +16,7 @@ from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_m
 from buddyline.solver_service.network.belief import KnownPlace
 from buddyline.solver_service.network.estimate import NetRow
 from buddyline.solver_service.network.filter import NetFilter
-from buddyline.solver_service.results import view_of
+from buddyline.solver_service.results import NUMERIC_ERRORS, view_of
 from buddyline.solver_service.streams import STOPPED_NS, NodeStream
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen
 from buddyline.solver_service.track.problems import as_ended
@@ -26,8 +26,6 @@ from msgspec import UNSET
 NET: Final = "main"
 # Rows come at the track's rate, but at no more than this: each instant has a row of every node.
 MOST_HZ: Final = 20.0
-# What absurd but finite values lead to, such as a depth of 1e308 m. Any other error is a fault of this program.
-NUMERIC_ERRORS: Final = (ArithmeticError, np.linalg.LinAlgError)
 
 
 class NetTracker:

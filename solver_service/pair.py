@@ -25,7 +25,7 @@ from buddyline.solver_service.headings import HeadingOffset
 from buddyline.solver_service.prior import PosePrior
 from buddyline.solver_service.rarity import Rarity
 from buddyline.solver_service.resting import LOOK_APART, LOOKS, NOT_IN_VIEW, Resting, look_apart
-from buddyline.solver_service.results import view_of
+from buddyline.solver_service.results import NUMERIC_ERRORS, view_of
 from msgspec import UNSET
 
 # Limits of one batch: its triggers, and their combinations of pairs of candidates. Larger arrays do not fit into the
@@ -125,7 +125,7 @@ class PairSolver:
         wanted = [one for one in batch if id(one) not in why or not self._resting.rests(one.stamp_ns)]
         try:
             readings = self._read(wanted) if wanted else None
-        except (ArithmeticError, ValueError) as error:
+        except NUMERIC_ERRORS as error:
             if len(batch) == 1:
                 return [self._out_of_range(batch[0], error)]
             # One trigger has absurd but finite values, such as 1e300, which make a matrix singular: solve one by one.
@@ -151,7 +151,7 @@ class PairSolver:
         """Solve one trigger by itself."""
         try:
             readings = self._read([one])
-        except (ArithmeticError, ValueError) as error:
+        except NUMERIC_ERRORS as error:
             return self._out_of_range(one, error)
         return self._decide(one, readings, 0)
 
@@ -187,7 +187,7 @@ class PairSolver:
             self._resting.take(stamp_ns, found)
             if isinstance(found, Fix):
                 self._remember(matched, found)
-        except (ArithmeticError, ValueError) as error:
+        except NUMERIC_ERRORS as error:
             return self._out_of_range(matched, error)
         return found
 
@@ -198,7 +198,7 @@ class PairSolver:
 
     def _remember(self, matched: Matched, fix: Fix) -> None:
         if not math.isfinite(fix.T_a_b.t_m.sum() + fix.covariance.sum()):
-            raise ValueError("the pose is not finite")
+            raise ArithmeticError("the pose is not finite")
         self._prior.update(matched.stamp_ns, fix)
         if self.alignment is not None:
             stamp_a_ns, stamp_b_ns = matched.frame_a.stamp_ns, matched.frame_b.stamp_ns

@@ -18,6 +18,8 @@ from msgspec.structs import replace
 
 # Where the border cuts a light, the light may be off by up to the depth of the cut, either way: 1 sd over that depth.
 _CUT_SHARE: Final = 3.0**-0.5
+# What absurd but finite values lead to, such as a depth of 1e308 m. Any other error is a fault of this program.
+NUMERIC_ERRORS: Final = (ArithmeticError, np.linalg.LinAlgError)
 
 
 def rig_of(info: NodeInfo) -> Rig:

@@ -30,7 +30,7 @@ from buddyline.solver_service.geometry.observation import View
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, rotation_exp
 from buddyline.solver_service.resting import LOOK_APART, LOOKS, REST_NS
-from buddyline.solver_service.results import view_of
+from buddyline.solver_service.results import NUMERIC_ERRORS, view_of
 from buddyline.solver_service.sensors import KEPT_NS
 from buddyline.solver_service.streams import NodeStream
 from buddyline.solver_service.track.clocks import Clocks, clock_now, clocks_of
@@ -151,7 +151,7 @@ class PairTracker:
                 self._advance(self._settled_ns + S_NS)
                 a, b = map(joined, self._pieces)
                 return clocks_of((a, b), self._fixes)
-            except (ArithmeticError, ValueError) as error:
+            except NUMERIC_ERRORS as error:
                 self._start_anew(str(error))
                 return None
 
@@ -160,7 +160,7 @@ class PairTracker:
         with np.errstate(all="ignore"):
             try:
                 return self._take(outcomes)
-            except (ArithmeticError, ValueError) as error:
+            except NUMERIC_ERRORS as error:
                 self._start_anew(str(error))
                 return []
 
@@ -246,7 +246,7 @@ class PairTracker:
                     return messages
                 a, b = map(joined, self._pieces)
                 found = smooth((a, b), self._fixes, self._due(self._first_ns or 0, end_ns))
-            except (ArithmeticError, ValueError) as error:
+            except NUMERIC_ERRORS as error:
                 self._start_anew(str(error))
                 return []
         self._note(found.problems)

@@ -179,7 +179,10 @@ class TrackPool(TrackSteps):
                 if chi2 > 12.0:
                     continue
                 child = base.copied()
-                gain = -0.5 * chi2 - 0.5 * math.log(np.linalg.det(S)) - math.log(2.0 * math.pi) - log_clutter
+                spread = float(np.linalg.det(S))
+                if spread <= 0.0:
+                    raise ArithmeticError("a light's place without a covariance")
+                gain = -0.5 * chi2 - 0.5 * math.log(spread) - math.log(2.0 * math.pi) - log_clutter
                 child.evidence += gain + math.log(0.2)
                 chosen = ((k, light, START_PX**2),)
                 self._update_lights(child, Association(chosen, np.ones(2), 0.0), y, H, sight)

@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from buddyline.protocol.messages import Candidates
+from buddyline.solver_service import pair
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.observation import Settings
-from buddyline.solver_service.geometry.trigger import Fix, NoFix
+from buddyline.solver_service.geometry.trigger import Fix, NoFix, TriggerReadings
 from buddyline.solver_service.pair import PairSolver
+from buddyline.solver_service.prior import PosePrior
 
 from tests.solver_service.conftest import dive_messages
 
@@ -80,3 +82,28 @@ def test_an_absurd_value_spoils_no_other_trigger(matched, absurd):
     assert_same(together, solve(spoiled, 1))
     assert_same(together[:20], solve(matched, 1)[:20])
     assert sum(isinstance(fix, Fix) for fix in together[21:]) > 30
+
+
+@pytest.mark.parametrize("place", ["read", "decide", "remember"])
+def test_only_what_absurd_values_lead_to_is_a_rejection(matched, monkeypatch, place):
+    """A fault of this program must not look like a lack of data."""
+
+    def fail_with(error):
+        def fails(*_):
+            raise error
+
+        owner, name = {
+            "read": (pair, "read_triggers"),
+            "decide": (TriggerReadings, "decide"),
+            "remember": (PosePrior, "update"),
+        }[place]
+        monkeypatch.setattr(owner, name, fails)
+
+    fail_with(np.linalg.LinAlgError("Singular matrix"))
+    found = solve(matched[:4], 4)
+    assert not any(isinstance(one, Fix) for one in found)
+    said = "degenerate", "values from a or b are out of numeric range (Singular matrix)"
+    assert said in {(one.reason, one.detail) for one in found}
+    fail_with(ValueError("a fault"))
+    with pytest.raises(ValueError, match="a fault"):
+        solve(matched[:4], 4)

@@ -7,10 +7,11 @@ import pytest
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Candidates, Depth, Imu, NodeInfo, Rejected, RelativePose, Track
 from buddyline.protocol.topics import TRACK, TRACK_LAG, key_of
-from buddyline.solver_service import pair_core
+from buddyline.solver_service import pair_core, tracking
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.streams import NodeStream
+from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.tracking import PairTracker, TrackSettings
 from msgspec import UNSET
 from msgspec.structs import replace
@@ -207,6 +208,28 @@ def test_a_track_goes_on_after_absurd_values(inertial_dive):
     tracks, _ = tracks_of(broken, "filter")
     assert all(np.isfinite(one.covariance).all() for one in tracks)
     assert tracks[-1].stamp_ns > messages[-1].stamp_ns - 2 * S_NS
+
+
+@pytest.mark.parametrize("mode", ["filter", "smooth"])
+def test_only_what_absurd_values_lead_to_begins_the_track_anew(monkeypatch, mode):
+    """A fault of this program must not look like a lack of poses."""
+    messages, _ = dive_messages(seconds=1.5, imu=True)
+
+    def fail_with(error):
+        def fails(*_):
+            raise error
+
+        owner, name = (TrackFilter, "advance") if mode == "filter" else (tracking, "smooth")
+        monkeypatch.setattr(owner, name, fails)
+
+    fail_with(np.linalg.LinAlgError("Singular matrix"))
+    tracks, core = tracks_of(messages, mode)
+    assert tracks == []
+    said = "values from a or b were out of numeric range (Singular matrix): the track started anew"
+    assert core.pairs["a", "b"].tracker.problems == [said]
+    fail_with(ValueError("a fault"))
+    with pytest.raises(ValueError, match="a fault"):
+        tracks_of(messages, mode)
 
 
 def test_a_changed_calibration_ends_one_track_and_begins_another(inertial_dive):
