@@ -1,6 +1,7 @@
 """The imports of the project's modules, read from their syntax: at any place in a module, also for types only."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 FOLDERS = {
@@ -24,9 +25,14 @@ def modules(root: Path) -> dict[str, Path]:
 
 def imported_by(name: str, path: Path) -> set[str]:
     """Return the absolute names that a module imports; of `from a import b` both a and a.b."""
-    package = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
+    return _imported(name, path.name == "__init__.py", path.read_text(encoding="utf-8"))
+
+
+@cache
+def _imported(name: str, is_package: bool, text: str) -> set[str]:
+    package = name.split(".") if is_package else name.split(".")[:-1]
     names: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):

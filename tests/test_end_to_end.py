@@ -51,7 +51,7 @@ def two_logs(tmp_path):
     return [tmp_path / "a.mcap", tmp_path / "b.mcap"]
 
 
-@pytest.mark.parametrize("speed", ["1", "0"])
+@pytest.mark.parametrize("speed", [pytest.param("1", marks=pytest.mark.slow), "0"])
 def test_live_playback_gives_the_offline_poses(tmp_path, two_logs, speed):
     offline = buddyline("solve", *two_logs, "-o", tmp_path / "offline.mcap", "--json")
     assert offline.returncode == 0, offline.stderr
@@ -76,7 +76,7 @@ def test_live_playback_gives_the_offline_poses(tmp_path, two_logs, speed):
     assert modes_of(recorded, "track_lag") == {"lag"}
 
 
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGKILL])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGHUP, marks=pytest.mark.slow), signal.SIGKILL])
 def test_a_killed_demo_leaves_nothing_running(number):
     demo = Process("demo", "--environment", "basin", "--rate", "4")
     try:

@@ -25,6 +25,7 @@ def told_of(path, node):
         return sum(1 for _ in reader.records(lambda key: key == f"buddyline/net/main/{node}"))
 
 
+@pytest.mark.slow
 def test_four_nodes_on_one_hub_are_in_one_frame(dive, tmp_path):
     live = tmp_path / "live.mcap"
     with recorded_solver(live) as (endpoint, _):

@@ -6,6 +6,7 @@ from collections import Counter
 import pytest
 from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
 from buddyline.protocol.messages import Candidates, Rejected, RelativePose, SolverStatus
+from buddyline.tools.cli import main
 from msgspec.structs import replace
 
 from tests.processes import REPOSITORY, buddyline, recorded_solver, until
@@ -67,10 +68,11 @@ def test_offline_every_pair_has_an_outcome_for_every_trigger(three_logs, offline
 
 
 @pytest.mark.parametrize("nodes", [["a,c"], ["c", "a"]])
-def test_offline_the_given_nodes_restrict_the_pairs(three_logs, offline, tmp_path, nodes):
-    logs, _ = three_logs
-    done = buddyline("solve", *logs, "-o", tmp_path / "out.mcap", "--json", "--nodes", *nodes)
-    summary = json.loads(done.stdout)
+def test_offline_the_given_nodes_restrict_the_pairs(three_logs, offline, tmp_path, capsys, nodes):
+    logs = [str(log) for log in three_logs[0]]
+    words = ["-o", str(tmp_path / "out.mcap"), "--track", "none", "--json", "--nodes", *nodes]
+    assert main(["solve", *logs, *words]) == 0
+    summary = json.loads(capsys.readouterr().out)
     first, second = nodes[0].split(",") if len(nodes) == 1 else nodes
     assert (summary["node_a"], summary["node_b"]) == (first, second)
     pairs = {one["node_a"] + one["node_b"]: one for one in offline[1]["pairs"]}
@@ -80,17 +82,18 @@ def test_offline_the_given_nodes_restrict_the_pairs(three_logs, offline, tmp_pat
         assert not any(key.startswith("buddyline/node/b/") for key in reader.keys)
 
 
-def test_offline_two_nodes_of_one_id_are_named(three_logs, tmp_path):
+def test_offline_two_nodes_of_one_id_are_named(three_logs, tmp_path, caplog):
     *logs, third = three_logs[0]
     twin = tmp_path / "twin.mcap"
     with DiveLogReader(third) as reader, DiveLogWriter(twin) as writer:
         for record in reader.records():
             one = replace(record.open().message, node="b", stamp_ns=record.open().message.stamp_ns + 3_000_000)
             writer.write_message(replace(one, boot="another") if isinstance(one, Candidates) else one)
-    done = buddyline("solve", *logs, twin, "-o", tmp_path / "out.mcap", "--track", "none")
+    out = tmp_path / "out.mcap"
+    assert main(["solve", *map(str, logs), str(twin), "-o", str(out), "--track", "none"]) == 0
     said = "two nodes have the id b: give each its own"
-    assert done.stderr.count(said) == 1
-    (status,) = log_of(tmp_path / "out.mcap")[2]
+    assert caplog.text.count(said) == 1
+    (status,) = log_of(out)[2]
     assert said in status.problem
 
 
@@ -107,6 +110,7 @@ def test_offline_a_third_bar_takes_no_outcome_from_a_pair(tmp_path):
         assert len(poses) > 0.8 * len(outcomes[pair])
 
 
+@pytest.mark.slow
 def test_three_nodes_on_one_hub_and_one_solver(three_logs, offline, tmp_path):
     logs, _ = three_logs
     expected, _, _ = log_of(offline[0])

@@ -1,8 +1,11 @@
-"""One of the faults with every run of the tests; all of them, twenty times each, by `python -m tests.faults`."""
+"""One of the faults among the slow tests; all of them, twenty times each, by `python -m tests.faults`."""
+
+import pytest
 
 from tests.faults.scenarios import solver
 
 
+@pytest.mark.slow
 def test_a_solver_that_is_killed_and_back_answers_every_trigger_once():
     tally = solver(1).tally
     assert tally.triggers > 10

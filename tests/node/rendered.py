@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,10 +35,17 @@ def lamp_picture(
     light = np.zeros((height, width))
     for u_px, v_px in lamps_px:
         distance = np.hypot(u - u_px, v - v_px)
-        cosine = (u - u_px) / np.maximum(distance, 1e-6)
         light += core * np.exp(-0.5 * (distance / core_px) ** 2)
-        leans = lean * distance / (distance + LEANS_FROM_PX)
-        light += glow * np.exp(leans * (cosine - 1.0)) / np.maximum(distance, 1.0)
+        if glow:
+            cosine = (u - u_px) / np.maximum(distance, 1e-6)
+            leans = lean * distance / (distance + LEANS_FROM_PX)
+            light += glow * np.exp(leans * (cosine - 1.0)) / np.maximum(distance, 1.0)
     picture = ground + light[:, :, None] * WATER_BGR
-    picture += np.random.default_rng(seed).normal(0.0, noise, picture.shape)
+    picture += _noise(seed, noise, height, width)
     return np.clip(np.round(picture), 0, 255).astype(np.uint8)
+
+
+@lru_cache(maxsize=2)
+def _noise(seed: int, sigma: float, height: int, width: int) -> NDArray[np.float64]:
+    """Return the noise of a picture's three colours; most tests show many pictures of one seed."""
+    return np.random.default_rng(seed).normal(0.0, sigma, (height, width, 3))

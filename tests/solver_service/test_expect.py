@@ -39,10 +39,15 @@ def dive():
     return dive_messages(seconds=8.0, imu=True)
 
 
+@pytest.fixture(scope="module")
+def foretold(dive):
+    return expected_of(dive[0])
+
+
 @pytest.mark.parametrize("imu", [True, False], ids=["inertial unit", "attitude only"])
-def test_each_next_picture_is_foretold_before_it_is_taken(imu):
-    messages, world = dive_messages(seconds=8.0, imu=imu)
-    found = expected_of(messages)
+def test_each_next_picture_is_foretold_before_it_is_taken(dive, foretold, imu):
+    messages, world = dive if imu else dive_messages(seconds=8.0)
+    found = foretold if imu else expected_of(messages)
     # Inertial samples may come later than pictures: so long a track waits for the first of them.
     begin_ns = messages[0].stamp_ns + (0 if imu else SENSOR_WAIT_NS)
     frames = [message for message in messages if isinstance(message, Candidates) and message.stamp_ns > begin_ns]
@@ -63,10 +68,9 @@ def test_each_next_picture_is_foretold_before_it_is_taken(imu):
     assert 0.5 * np.mean(squares) > (0.15 if imu else 0.02)
 
 
-def test_an_expectation_serves_for_the_picture_after_the_next(dive):
-    messages, world = dive
-    found = expected_of(messages)
-    for one, _ in found:
+def test_an_expectation_serves_for_the_picture_after_the_next(dive, foretold):
+    _, world = dive
+    for one, _ in foretold:
         later = world.light_truth(one.node, one.stamp_ns + PERIOD_NS, 0)
         for light in one.lights:
             uu, _, vv = light.covariance_px2

@@ -12,9 +12,14 @@ from tests.solver_service.scenes import IDEAL, ODD_A, ODD_B, view
 GATE = 4.5
 
 
-@pytest.mark.parametrize("rigs", [(IDEAL, IDEAL), (ODD_A, ODD_B)], ids=["ideal", "odd"])
 @pytest.mark.parametrize(
-    ("count", "triggers"), [(9, 200), pytest.param(14, 25, marks=pytest.mark.slow)], ids=["few", "many"]
+    ("rigs", "count", "triggers"),
+    [
+        pytest.param((IDEAL, IDEAL), 9, 200, id="ideal, few"),
+        pytest.param((ODD_A, ODD_B), 9, 200, id="odd, few", marks=pytest.mark.slow),
+        pytest.param((IDEAL, IDEAL), 14, 25, id="ideal, many", marks=pytest.mark.slow),
+        pytest.param((ODD_A, ODD_B), 14, 25, id="odd, many", marks=pytest.mark.slow),
+    ],
 )
 def test_every_combination_within_both_gates_is_found(rigs, count, triggers):
     rng = np.random.default_rng(1)

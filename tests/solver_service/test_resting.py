@@ -136,7 +136,9 @@ def face_each_other(one: Placement, other: Placement) -> bool:
     return min(looks) > math.cos(math.radians(22.0)) * float(np.linalg.norm(across_m))
 
 
-@pytest.mark.parametrize(("placed", "nodes"), [(in_ring, "abcdef"), (in_line, "abcdefgh")])
+@pytest.mark.parametrize(
+    ("placed", "nodes"), [(in_ring, "abcdef"), pytest.param(in_line, "abcdefgh", marks=pytest.mark.slow)]
+)
 def test_in_a_crowd_of_another_shape_no_pair_in_view_is_lost(
     placed: Callable[[int, float], Placement], nodes: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -33,6 +33,11 @@ def inertial_dive():
     return dive_messages(seconds=12.0, imu=True)
 
 
+@pytest.fixture(scope="module")
+def filtered(inertial_dive):
+    return tracks_of(inertial_dive[0], "filter")[0]
+
+
 def rejected(stamp_ns):
     return Rejected(node_a="a", node_b="b", stamp_ns=stamp_ns, trigger=stamp_ns, reason="ambiguous", detail="")
 
@@ -41,9 +46,9 @@ def errors_m(tracks, world):
     return [np.linalg.norm(np.subtract(one.t_a_b_m, world.truth(one.stamp_ns, 0).t_a_b_m)) for one in tracks]
 
 
-def test_the_live_filter_gives_the_same_track_however_messages_are_interleaved(inertial_dive):
+def test_the_live_filter_gives_the_same_track_however_messages_are_interleaved(inertial_dive, filtered):
     messages, _ = inertial_dive
-    expected, _ = tracks_of(messages, "filter")
+    expected = filtered
     rng = random.Random(1)
     late_ns = {kind: rng.randrange(0, S_NS // 5) for kind in ("a", "b", Imu, Depth, Candidates)}
     shuffled = sorted(messages, key=lambda m: m.stamp_ns + late_ns.get(type(m), 0) + late_ns[m.node])
@@ -57,11 +62,16 @@ def test_the_live_filter_gives_the_same_track_however_messages_are_interleaved(i
         np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-6, atol=1e-12)
 
 
-@pytest.mark.parametrize("late_s", [0.6, 1.5, 2.5])
-def test_a_track_waits_for_inertial_samples_that_come_after_the_pictures(inertial_dive, late_s):
+@pytest.fixture(scope="module")
+def five_seconds(inertial_dive):
     messages, _ = inertial_dive
     messages = [message for message in messages if message.stamp_ns < messages[0].stamp_ns + 5 * S_NS]
-    expected, _ = tracks_of(messages, "filter", "lag")
+    return messages, tracks_of(messages, "filter", "lag")[0]
+
+
+@pytest.mark.parametrize("late_s", [0.6, 1.5, 2.5])
+def test_a_track_waits_for_inertial_samples_that_come_after_the_pictures(five_seconds, late_s):
+    messages, expected = five_seconds
     late = sorted(messages, key=lambda m: m.stamp_ns + (round(late_s * S_NS) if isinstance(m, Imu) else 0))
     found, core = tracks_of(late, "filter", "lag")
     assert sorted((one.mode, one.stamp_ns) for one in found) == sorted((one.mode, one.stamp_ns) for one in expected)
@@ -139,11 +149,11 @@ def test_a_track_begins_with_the_first_pose_however_many_messages_come_at_once()
         np.testing.assert_allclose(one.t_a_b_m, other.t_a_b_m, atol=1e-9)
 
 
-def test_each_mode_is_better_than_the_one_before_it_and_says_how_good_it_is(inertial_dive):
+def test_each_mode_is_better_than_the_one_before_it_and_says_how_good_it_is(inertial_dive, filtered):
     messages, world = inertial_dive
     medians_m = []
     for mode in ("filter", "lag", "smooth"):
-        tracks, _ = tracks_of(messages, mode)
+        tracks = filtered if mode == "filter" else tracks_of(messages, mode)[0]
         assert {one.mode for one in tracks} == {mode}
         off_m = np.array(errors_m(tracks, world))
         sigma_m = np.sqrt([one.covariance[0] + one.covariance[7] + one.covariance[14] for one in tracks])
@@ -232,6 +242,7 @@ def test_only_what_absurd_values_lead_to_begins_the_track_anew(monkeypatch, mode
         tracks_of(messages, mode)
 
 
+@pytest.mark.slow
 def test_a_changed_calibration_ends_one_track_and_begins_another(inertial_dive):
     messages, world = inertial_dive
     middle_ns = messages[0].stamp_ns + 6 * S_NS

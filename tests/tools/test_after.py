@@ -50,6 +50,7 @@ def corrections(folders, out):
     return times_ns / S_NS, np.array([moved[k].skew_ns - unmoved[k].skew_ns for k in common]) / S_NS
 
 
+@pytest.mark.slow
 def test_a_dive_s_folders_become_poses_track_and_report(folders, capsys):
     out = folders / "dive"
     assert main(["after", str(folders / "a"), str(folders / "b"), "-o", str(out)]) == 0

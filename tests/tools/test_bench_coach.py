@@ -60,7 +60,12 @@ def test_a_steered_node_turns_to_the_right_without_a_jump() -> None:
 
 
 @pytest.mark.parametrize(
-    "case", [f"{NEVER}a lamp beyond each border", f"{NEVER}one looks away", f"{NEVER}one looks up or down"]
+    "case",
+    [
+        f"{NEVER}one looks up or down",
+        pytest.param(f"{NEVER}a lamp beyond each border", marks=pytest.mark.slow),
+        pytest.param(f"{NEVER}one looks away", marks=pytest.mark.slow),
+    ],
 )
 def test_before_the_first_fix_the_words_lead_to_one(case: str) -> None:
     dives = [lose(WATERS[k % len(WATERS)], case, 8800 + k, imu=False) for k in range(4)]

@@ -18,6 +18,7 @@ def figures():
     return json.loads(out.getvalue())
 
 
+@pytest.mark.slow
 def test_lamps_are_found_at_the_exposure_that_is_locked_to_them(figures):
     for row in figures["waters"]:
         assert row["lights"] > 60
@@ -27,12 +28,14 @@ def test_lamps_are_found_at_the_exposure_that_is_locked_to_them(figures):
         assert row["false"] < 0.3
 
 
+@pytest.mark.slow
 def test_sigma_is_true_at_the_exposure_that_is_locked_to_the_lamps(figures):
     for row in figures["waters"]:
         assert 0.4 < row["nees"] < 1.5
         assert row["beyond"] < 0.05
 
 
+@pytest.mark.slow
 def test_every_light_belongs_to_one_range(figures):
     number = {row["class"]: row["lights"] for row in figures["classes"]}
     assert sum(count for name, count in number.items() if name.endswith(" m")) == number["all"]

@@ -133,6 +133,7 @@ def test_a_demo_whose_hub_cannot_start_ends_with_the_reason(tmp_path):
     assert "hub ended with status 2" in done.stderr.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_a_demo_gives_its_summary_whatever_files_are_in_the_current_folder(tmp_path):
     for name in ("protocol", "tools", "node", "numpy"):
         (tmp_path / f"{name}.py").write_text("raise SystemExit('not me')\n")

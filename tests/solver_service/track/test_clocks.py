@@ -14,7 +14,8 @@ from tests.solver_service.track.dives import Setting, filter_of, make
 from tests.solver_service.track.test_track import bare_of
 
 
-@pytest.mark.parametrize("clock_s", [0.05, pytest.param(-0.02, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("clock_s", [0.05, -0.02])
 def test_the_offset_is_found_within_its_sigma(clock_s: float) -> None:
     dive = make(8, Setting(seconds=25.0, poor=True, clock_s=clock_s))
     found = clocks_of(dive.records, dive.fixes)

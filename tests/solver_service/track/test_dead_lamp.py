@@ -76,6 +76,7 @@ def simulated(scenario: Scenario, seconds: float, mode: TrackMode = "smooth") ->
     return wrong, float((sigma_m < 0.05 * range_m).sum() / (seconds * 20.0))
 
 
+@pytest.mark.slow
 def test_a_track_that_is_replaced_and_that_no_fix_agreed_with_leaves_no_rows() -> None:
     """The first start takes the wrong lamp of a bar; the right one replaces it seconds later."""
     wrong, share = simulated(

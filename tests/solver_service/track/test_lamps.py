@@ -40,7 +40,12 @@ def status_problem(seed, seconds, *dead_lamps, mode="filter"):
 
 @pytest.mark.parametrize(
     ("seed", "lamp"),
-    [(0, "b.left"), (2, "a.left"), pytest.param(1, "b.right", marks=SLOW), pytest.param(3, "b.left", marks=SLOW)],
+    [
+        (0, "b.left"),
+        pytest.param(2, "a.left", marks=SLOW),
+        pytest.param(1, "b.right", marks=SLOW),
+        pytest.param(3, "b.left", marks=SLOW),
+    ],
 )
 def test_a_dead_lamp_is_named_within_ten_seconds(seed, lamp):
     node, side = lamp.split(".")

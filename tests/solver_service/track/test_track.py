@@ -15,11 +15,7 @@ from buddyline.solver_service.track.association import weigh
 from buddyline.solver_service.track.dive import (
     NodeRecord,
     Records,
-    goes_on,
-    in_pieces,
     last_ns,
-    of_one_clock,
-    parts_of,
     pass_over,
     smooth,
 )
@@ -27,7 +23,6 @@ from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.lag import TrackLag
 from buddyline.solver_service.track.output import TrackRow
-from buddyline.solver_service.track.state import CLOCK
 
 from tests.solver_service.track.dives import EPOCH_NS, KnownDive, Setting, filter_of, fix_errors, make, score
 
@@ -83,7 +78,7 @@ def of_means(record: NodeRecord) -> NodeRecord:
     )
 
 
-@pytest.mark.parametrize("poor", [False, True])
+@pytest.mark.parametrize("poor", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_means_of_the_samples_carry_the_filter_as_the_samples_do(poor: bool) -> None:
     """Five frames a second, as over a poor tether."""
     dive = make(2, replace(SHORT, rate_hz=5.0, poor=poor))
@@ -285,6 +280,7 @@ def test_many_dives(poor: bool) -> None:
     assert (np.median(ratios, axis=0) < (0.35, 0.28)).all()
 
 
+@pytest.mark.slow
 def test_a_dead_lamp_and_no_fix_at_all() -> None:
     dive = make(6, replace(SHORT, seconds=16.0, dead=((1, 0),)))
     whole = make(6, replace(SHORT, seconds=16.0))
@@ -305,6 +301,7 @@ def test_nodes_that_do_not_face_each_other_get_no_track(dive: KnownDive) -> None
     assert filter_of(dive.records, dive.fixes).advance(last_ns(dive.records), dive.stamps_ns)
 
 
+@pytest.mark.slow
 def test_clock_and_depth_offset_nobody_told_of() -> None:
     dive = make(2, replace(SHORT, seconds=20.0, clock_s=0.3, depth_offset_m=0.5))
     result = smooth(dive.records, dive.fixes, dive.stamps_ns)
@@ -315,6 +312,7 @@ def test_clock_and_depth_offset_nobody_told_of() -> None:
     assert judged.nees < 2.0
 
 
+@pytest.mark.slow
 def test_clocks_far_apart_without_inertial_units_give_no_track() -> None:
     dive = make(2, replace(SHORT, seconds=20.0, clock_s=0.3))
     result = smooth(bare_of(dive), dive.fixes, dive.stamps_ns)
@@ -322,7 +320,9 @@ def test_clocks_far_apart_without_inertial_units_give_no_track() -> None:
     assert any("clocks" in problem for problem in result.problems)
 
 
-@pytest.mark.parametrize("fault", ["g", "mount", "clipped"])
+@pytest.mark.parametrize(
+    "fault", ["clipped", *(pytest.param(fault, marks=pytest.mark.slow) for fault in ("g", "mount"))]
+)
 def test_a_faulty_unit_is_named_and_left_out(dive: KnownDive, fault: str) -> None:
     a, b = dive.records
     about = np.array(((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)))
@@ -373,78 +373,6 @@ def test_absurd_input_never_crashes(dive: KnownDive, harm: str) -> None:
     assert all(np.isfinite(row.covariance).all() and np.isfinite(row.t_a_b_m).all() for row in rows)
     if rows:
         assert score(dive, rows).wrong == 0
-
-
-@pytest.mark.parametrize(("parts_clock_s", "expected"), [([0.02], False), ([0.02, 0.05], False), ([0.0, 0.2], True)])
-def test_tracks_that_disagree_on_the_clocks_are_in_pieces(
-    dive: KnownDive, parts_clock_s: list[float], expected: bool
-) -> None:
-    first = filter_of(dive.records, dive.fixes)
-    first.advance(dive.stamps_ns[0] + 3_000_000_000)
-    [part] = parts_of(first)
-    parts = [replace(part, state=replace(part.state, clock_s=clock_s)) for clock_s in parts_clock_s]
-    assert in_pieces(parts) is expected
-
-
-@pytest.mark.parametrize(
-    ("parts_s", "expected"),
-    [
-        ([], True),
-        ([(0.0, 4.0, 0.02)], True),
-        # A false start, and the rest of the dive: no other offset of the clocks is worth a try.
-        ([(0.0, 1.3, 0.02), (1.2, 60.0, 0.001)], True),
-        ([(0.0, 1.3, 0.0), (1.2, 60.0, 0.05)], False),
-        ([(0.0, 15.0, 0.0), (15.0, 60.0, 0.0)], False),
-    ],
-)
-def test_a_track_of_nearly_all_of_a_dive_goes_on(
-    dive: KnownDive, parts_s: list[tuple[float, float, float]], expected: bool
-) -> None:
-    first = filter_of(dive.records, dive.fixes)
-    first.advance(dive.stamps_ns[0] + 3_000_000_000)
-    [part] = parts_of(first)
-    parts = [
-        replace(part, start_s=start_s, t_s=end_s + 0.5, end_s=end_s, state=replace(part.state, clock_s=clock_s))
-        for start_s, end_s, clock_s in parts_s
-    ]
-    for one in parts:
-        one.covariance = one.covariance.copy()
-        one.covariance[CLOCK, CLOCK] = 0.001**2
-    assert goes_on(parts) is expected
-
-
-@pytest.mark.parametrize(
-    ("clocks_s", "evidence", "kept"),
-    [
-        ([0.001, 0.003], [400.0, 14000.0], [0, 1]),
-        ([0.057, 0.0], [400.0, 14000.0], [1]),
-        ([0.0, 0.057], [14000.0, 400.0], [0]),
-        ([0.0, 0.057, 0.0], [900.0, 400.0, 800.0], [0, 2]),
-        # Clocks that drift, and five minutes without a light between two tracks.
-        ([0.0, 0.02], [14000.0, 400.0], [0, 1]),
-        # What no track knows is not settled by the longest.
-        ([0.0, 0.2], [14000.0, 400.0], [0, 1]),
-    ],
-)
-def test_a_track_that_contradicts_the_others_on_the_clocks_is_left_out(
-    dive: KnownDive, clocks_s: list[float], evidence: list[float], kept: list[int]
-) -> None:
-    first = filter_of(dive.records, dive.fixes)
-    first.advance(dive.stamps_ns[0] + 3_000_000_000)
-    [part] = parts_of(first)
-    covariance = part.covariance.copy()
-    covariance[CLOCK, CLOCK] = 0.0025**2
-    parts = [
-        replace(
-            part,
-            t_s=part.t_s + (300.0 * k if clock_s == 0.02 else k),
-            state=replace(part.state, clock_s=clock_s),
-            covariance=covariance,
-            evidence=explained,
-        )
-        for k, (clock_s, explained) in enumerate(zip(clocks_s, evidence, strict=True))
-    ]
-    assert [parts.index(one) for one in of_one_clock(parts)] == kept
 
 
 def test_a_lamp_behind_the_camera_is_no_candidates() -> None:

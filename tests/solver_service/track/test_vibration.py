@@ -108,6 +108,7 @@ def shaken(dive: KnownDive, size_radps: float) -> KnownDive:
     return replace(dive, records=(dive.records[0], replace(b, gyro_radps=b.gyro_radps + swing)))
 
 
+@pytest.mark.slow
 def test_a_unit_that_shakes_alone_costs_little_once_the_lights_have_told_so() -> None:
     still = make(21, Setting(seconds=12.0))
     dive = shaken(still, 0.04)

@@ -204,6 +204,7 @@ def test_slopes_by_a_tilts_wandering_are_those_of_differences() -> None:
     assert np.abs(walking.moved[SHAKE[0], 2] - moved).max() < 1e-4 * np.abs(moved).max()
 
 
+@pytest.mark.slow
 def test_how_long_a_tilts_error_lasts_is_found() -> None:
     rng = np.random.default_rng(6)
     for lasts_s in (0.5, 5.0):
