@@ -193,7 +193,7 @@ def plan(info: NodeInfo, sigma_px: float, compass_rad: float, reach_m: float, to
     ends_m = {name: _end_m(errors[:, i].tolist(), limit) for i, (name, limit) in enumerate(tolerances.items())}
     known = {name: end_m for name, end_m in ends_m.items() if end_m is not None}
     if math.isfinite(reach_m):
-        known["visibility"] = reach_m
+        known["reach"] = reach_m
     limit = min(known, key=lambda name: known[name], default="")
     return Plan(rows, ends_m, reach_m, near_m, known.get(limit), limit)
 
@@ -227,7 +227,7 @@ def as_text(chosen: Plan, spacings: dict[float, Plan], baseline_m: float, visibi
     """Return the plan for a person."""
     lines = [
         f"lights {baseline_m:g} m apart, RMS errors to expect (the Cramér-Rao bound; azimuth with the compass)",
-        f"{'range, m':>9} {'range, m':>9} {'position, m':>12} {'azimuth, deg':>13} {'rotation, deg':>14}",
+        f"{'at, m':>9} {'range, m':>9} {'position, m':>12} {'azimuth, deg':>13} {'rotation, deg':>14}",
     ]
     for row in chosen.rows:
         note = "" if row.in_view else "  the lights do not both fit the picture"
@@ -237,19 +237,24 @@ def as_text(chosen: Plan, spacings: dict[float, Plan], baseline_m: float, visibi
             f" {math.degrees(row.azimuth_error_rad):13.2f} {math.degrees(row.rotation_error_rad):14.2f}"
             f"  {'good' if row.within else '-'}{note}"
         )
-    lines += ["", "where it ends, m, by the spacing of the lights", f"{'spacing':>9} {'from':>6} {'range':>7}"]
-    lines[-1] += f" {'position':>9} {'azimuth':>8} {'visibility':>11}  good up to"
+    lines += [
+        "",
+        "where it ends, m, by the spacing of the lights (reach: farther they are too faint)",
+        f"{'spacing':>9} {'from':>6} {'range':>7}",
+    ]
+    lines[-1] += f" {'position':>9} {'azimuth':>8} {'reach':>7}  good up to"
     for spacing, one in spacings.items():
         ends = [_far(one.ends_m[name]) for name in ("range", "position", "azimuth")]
         reach = f"{one.reach_m:.1f}" if math.isfinite(one.reach_m) else "-"
         far = f"{one.far_m:.1f} m, by {one.limit}" if one.far_m is not None else f"more than {RANGES_M[-1]:g} m"
-        lines.append(f"{spacing:9g} {one.near_m:6.1f} {ends[0]:>7} {ends[1]:>9} {ends[2]:>8} {reach:>11}  {far}")
-    if chosen.limit == "visibility":
+        lines.append(f"{spacing:9g} {one.near_m:6.1f} {ends[0]:>7} {ends[1]:>9} {ends[2]:>8} {reach:>7}  {far}")
+    if chosen.limit == "reach":
         geometry = [end_m for end_m in chosen.ends_m.values() if end_m is not None]
         beyond = f"would do up to {min(geometry):.1f} m" if geometry else f"would do beyond {RANGES_M[-1]:g} m"
         lines += [
             "",
-            f"visibility of {visibility_m:g} m ends it, not geometry, which {beyond}: wider lights gain nothing",
+            f"where a diver sees {visibility_m:g} m far, the lights reach {chosen.reach_m:.1f} m; "
+            f"geometry {beyond}: wider lights gain nothing",
         ]
     return "\n".join(lines)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import socket
 import struct
 import threading
@@ -16,6 +17,7 @@ from buddyline.protocol.divelog import DiveLogReader
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.security import RefusedError, Tls, refusal
 from buddyline.protocol.zenoh_bus import connect, open_hub
+from buddyline.tools.installation.init import text_of
 
 from tests.processes import PATIENCE_S, Process, free_endpoint
 from tests.tools.identities import at, copy_of, expired, join, make_keys, tls, tls_endpoint
@@ -159,15 +161,16 @@ def test_a_hub_that_closes_during_the_handshake_is_tried_again(keys: Path) -> No
 
 
 def test_a_refused_node_still_records_and_reports_the_refusal(keys: Path, tmp_path: Path) -> None:
-    """Processes from the files as `buddyline keys` wrote them, but for the endpoint."""
-    own = copy_of(keys, tmp_path / "own")
-    at(own, tls_endpoint())
-    config = own / "node-a.toml"
-    config.write_text(config.read_text().replace("[tls]", f'[record]\ndirectory = "{tmp_path}/logs"\n\n[tls]'))
+    """Processes from the files as `buddyline keys` and `init` wrote them, but for endpoint and folder."""
+    own, endpoint = copy_of(keys, tmp_path / "own"), tls_endpoint()
+    at(own, endpoint)
+    config = own / "a.toml"
+    text = text_of("node", "a", endpoint, simulated=True)
+    config.write_text(re.sub(r'^directory = "[^"]*"', f'directory = "{tmp_path}/logs"', text, flags=re.MULTILINE))
     expired(own, "node-a")
     with (
         Process("hub", "--config", own / "hub.toml") as hub,
-        Process("node", "--config", own / "node-a.toml") as node,
+        Process("node", "--config", config) as node,
         Process("record", tmp_path / "r.mcap", "--config", own / "viewer.toml") as record,
     ):
         hub.wait_for("TLS, client certificates")

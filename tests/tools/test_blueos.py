@@ -115,7 +115,7 @@ def test_its_script_makes_keys_and_runs_hub_solver_page_and_bridge(tmp_path: Pat
         try:
             (heartbeat,) = mavlink.MAVLink(None).parse_buffer(autopilot.recv(65535))
             assert (heartbeat.get_type(), heartbeat.get_srcComponent()) == ("HEARTBEAT", 197)
-            assert {path.name for path in (tmp_path / "keys").glob("node-*.toml")} == {"node-a.toml", "node-b.toml"}
+            assert {path.name for path in (tmp_path / "keys").glob("node-*.crt")} == {"node-a.crt", "node-b.crt"}
             assert script.poll() is None
         finally:
             script.send_signal(signal.SIGTERM)

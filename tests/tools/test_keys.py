@@ -27,11 +27,14 @@ def spoilt(keys, tmp_path):
     return copy_of(keys, tmp_path / "keys")
 
 
-def test_the_written_configurations_load_and_name_the_right_identities(keys):
+def test_the_written_configurations_load_and_name_the_right_identities(spoilt):
+    keys = spoilt
     hub = load_hub_config(str(keys / "hub.toml"))
     assert hub.nodes == ["a", "b"]
     assert check_exposure(hub, insecure=False) is None
-    node = load_node_config(keys / "node-a.toml")
+    words = ["--node", "a", "--connect", "tls/127.0.0.1:7447", "-o", str(keys / "a.toml")]
+    assert main(["init", "node", *words]) == 0
+    node = load_node_config(keys / "a.toml")
     assert (node.node, node.connect, node.tls) == ("a", "tls/127.0.0.1:7447", tls(keys, "node-a"))
     check_identity(node.tls, "node-a")
     assert load_solver_config(keys / "solver.toml").tls == tls(keys, "solver")

@@ -50,7 +50,7 @@ def test_wider_lights_measure_farther_and_visibility_ends_it(capsys):
     assert ends_m == sorted(ends_m)
     # sd(l) grows with the square of the range over the spacing: four times the lights, twice as far.
     assert ends_m[-1] / ends_m[0] == pytest.approx(2.0, rel=0.1)
-    assert murky["limit"] == "visibility"
+    assert murky["limit"] == "reach"
     assert murky["far_m"] == murky["reach_m"] == pytest.approx(light_reach_m(3.0))
     assert [row["within"] for row in murky["rows"]] == [
         1.0 < row["range_m"] <= murky["reach_m"] for row in murky["rows"]
@@ -64,7 +64,7 @@ def test_wider_lights_measure_farther_and_visibility_ends_it(capsys):
 def test_the_table_names_what_limits_the_range(capsys):
     assert main(["plan", "--visibility", "3"]) == 0
     text = capsys.readouterr().out
-    assert "visibility of 3 m ends it" in text
+    assert "where a diver sees 3 m far, the lights reach 7.5 m; geometry would do up to" in text
     assert "too faint" in text
 
 

@@ -109,18 +109,17 @@ def _init(directory: Path, host: str, days: int, authority_days: int) -> list[Pa
 
 def _client(authority: Authority, args: argparse.Namespace, days: int) -> list[Path]:
     name = args.whose if args.whose in ROLES else node_name(check_node_id(args.node))
-    made = authority.issue(name, days)
-    path = authority.directory / f"{name}.toml"
-    connect = f'connect = "tls/{authority.hub_host()}:{PORT}"\n\n{_tls_table(name)}'
-    first = f'node = "{args.node}"\n' if args.whose == "node" else ""
-    write_new(
-        path, f"# For the configuration of {name}; ca.crt, {name}.crt and {name}.key go beside it.\n{first}{connect}"
-    )
+    made, hub = authority.issue(name, days), f"tls/{authority.hub_host()}:{PORT}"
+    kept = "the key stays readable by its user alone"
     if args.whose == "node":
         _admit(authority.directory / "hub.toml", args.node)
-    _say(
-        f"copy ca.crt, {name}.crt, {name}.key and {name}.toml to that machine; the key stays readable by its user alone"
-    )
+        _say(f"copy ca.crt, {name}.crt and {name}.key to that machine, beside its configuration; {kept}")
+        _say(f"`buddyline init node --node {args.node} --connect {hub}` writes the configuration")
+        return made
+    path = authority.directory / f"{name}.toml"
+    text = f'connect = "{hub}"\n\n{_tls_table(name)}'
+    write_new(path, f"# For the configuration of {name}; ca.crt, {name}.crt and {name}.key go beside it.\n{text}")
+    _say(f"copy ca.crt, {name}.crt, {name}.key and {name}.toml to that machine; {kept}")
     return [*made, path]
 
 
