@@ -21,7 +21,7 @@ from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.smoother import Path, rows_between, smoothed
 from buddyline.solver_service.track.start import CLOCK_S, broad_start
 from buddyline.solver_service.track.state import CLOCK, NAV
-from buddyline.solver_service.track.stepping import KNOWN_CLOCK_S, PassGuide
+from buddyline.solver_service.track.stepping import KNOWN_CLOCK_S
 from buddyline.solver_service.track.trail import Trail
 from buddyline.solver_service.track.vibration import Shares, fast_part, sudden_turn
 from buddyline.solver_service.track.walking import joint
@@ -216,10 +216,10 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
             second.unrest = unrest
         since_s = -math.inf
         for path, end_s, shaking in paths:
-            guide_by(second, path)
+            second.guide_by(path)
             earlier = _path_before(records, clock_ns, path, since_s, shares) if to_beginning else None
             if earlier is not None:
-                guide_by(second, earlier)
+                second.guide_by(earlier)
             whole = earlier or path
             state = replace(whole.state(0), clock_s=0.0)
             begun = broad_start(second.nodes, state, clock_sigma_s, whole.oldest, shaking)
@@ -378,13 +378,6 @@ def parts_of(track: TrackFilter) -> list[Estimate]:
     if track.main is not None and track.main.confirmed and track.main.steps:
         parts.append(track.main)
     return parts
-
-
-def guide_by(track: TrackFilter, path: Path) -> None:
-    """Tell a filter what a pass knew at each picture."""
-    for step, looks in enumerate(path.looks):
-        for look in looks:
-            track.guides[look.node, look.stamp_ns] = PassGuide(path, step, look)
 
 
 def _smoothed(track: TrackFilter, parts: Sequence[Estimate], outputs_ns: Sequence[int]) -> Smoothed:

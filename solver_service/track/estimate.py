@@ -38,9 +38,8 @@ class Estimate:
     pictures, on end, a light should be and none was used. unseen_by: a node that has shown no light yet.
 
     How well it fits: evidence: log odds over clutter; evidence_by: of each node's pictures. baseline: the main
-    estimate's at the start. surprise, told: chi^2 of the lights used, and of how many residuals. fit: their log
-    likelihood. agreed_s: when a fix last agreed with it, inf where none did; agreed: how many did; contradicted: how
-    many since then did not.
+    estimate's at the start. surprise, told: chi^2 of the lights used, and of how many residuals. agreed_s: when a fix
+    last agreed with it, inf where none did; agreed: how many did; contradicted: how many since then did not.
 
     Its life: searched: it started without a fix. skip_s: pictures within this after start_s made it, and tell nothing
     new. patience_s: how long it may stay unconfirmed. end_s: later pictures are not its own. course: the evidence over
@@ -70,7 +69,6 @@ class Estimate:
     follows_walk: bool = False
     wide: bool = False
     surprise: float = 0.0
-    fit: float = 0.0
     told: int = 0
     end_s: float = np.inf
     skip_s: float = 0.02

@@ -14,10 +14,12 @@ from buddyline.solver_service.track.inputs import TrackNode
 from buddyline.solver_service.track.intake import newest_before
 from buddyline.solver_service.track.lights import BLOCK, Sight
 from buddyline.solver_service.track.search import starts
+from buddyline.solver_service.track.shaking import Shaking
+from buddyline.solver_service.track.smoother import smoothed
 from buddyline.solver_service.track.start import CLOCK_S, constants_of
 from buddyline.solver_service.track.state import PHI, R_, State, of_place, place_covariance
 from buddyline.solver_service.track.stepping import HOLD_S, TICK_S, TrackSteps
-from buddyline.solver_service.track.trail import Chosen
+from buddyline.solver_service.track.trail import Chosen, Trail
 
 # A start without a fix: how often one is tried, how long after the last fix, for how long it and how many are kept.
 SEARCH_EVERY_S: Final = 0.45
@@ -65,51 +67,64 @@ class TrackPool(TrackSteps):
             self._sights.popleft()
 
     def _replayed(self, estimate: Estimate) -> Estimate:
-        """Give an estimate anew from its start, from the state that it has come to since.
+        """Give an estimate anew from its start, with its lights decided again by all pictures since.
 
-        A start's first updates are far from linear: its covariance is too small for what they left.
+        A start's first updates are far from linear: its covariance is too small for what they left, so that it misses
+        lights that do not fit. The first pass starts from the state that it has come to, taken back; the next from what
+        the pass before, smoothed, gives for the start.
         """
+        again, path = estimate, None
+        keep_s, self._keep_s = self._keep_s, math.inf
         for _ in range(REPLAYS):
-            state = self._rewound(estimate, estimate.start_s)
-            learned = REPLAY_SIGMAS * np.sqrt(np.diag(estimate.covariance))
-            place = REPLAY_SIGMAS * np.sqrt(np.diag(place_covariance(estimate.state, estimate.covariance)))
-            range_m = float(np.linalg.norm(state.r_m))
-            untold, variances = constants_of(self.nodes, state.R, state.r_m, self.clock_sigma_s)
-            # What was learned of the constants is learned anew: the same lights must not count twice.
-            state = untold.moved(state.r_m, state.v_mps, state.R)
-            P = np.diag(variances)
-            P[R_, R_] = np.diag(np.maximum(place, REPLAY_SHARE * range_m) ** 2)
-            level = REPLAY_RAD**2 * np.eye(3)
-            P[PHI[0], PHI[0]] = P[PHI[0], PHI[1]] = P[PHI[1], PHI[0]] = level
-            P[PHI[1], PHI[1]] = level + np.diag(np.maximum(learned[PHI[1]], REPLAY_RAD) ** 2)
-            again = Estimate(
-                estimate.start_s,
-                state,
-                of_place(state, P),
-                estimate.start_s,
-                given=estimate.used,
-                used=estimate.used,
-                searched=True,
-            )
-            self._open(again)
+            state = self._rewound(estimate, estimate.start_s) if path is None else path.state(0)
+            again = self._begun_again(estimate, state, again.shaking, estimate.used if path is None else {})
             for t_s, sight in self._sights:
                 if estimate.start_s <= t_s <= estimate.t_s:
                     self._step(again, t_s, sight)
-            estimate = estimate.copied(
-                t_s=again.t_s,
-                state=again.state,
-                covariance=again.covariance,
-                shaking=again.shaking,
-                surprise=again.surprise,
-                told=again.told,
-                fit=again.fit,
-                evidence=estimate.evidence + again.fit - estimate.fit,
-                steps=again.steps,
-                attitude_s=again.attitude_s,
-                depth_s=again.depth_s,
-                rates_radps=again.rates_radps,
-            )
-        return estimate
+            path = smoothed(again.steps)
+            self.guide_by(path)
+        self._keep_s = keep_s
+        self.guides = {}
+        return estimate.copied(
+            t_s=again.t_s,
+            state=again.state,
+            covariance=again.covariance,
+            shaking=again.shaking,
+            surprise=again.surprise,
+            told=again.told,
+            steps=again.steps if keep_s else Trail(),
+            attitude_s=again.attitude_s,
+            depth_s=again.depth_s,
+            rates_radps=again.rates_radps,
+        )
+
+    def _begun_again(
+        self, estimate: Estimate, state: State, shaking: Shaking, given: dict[tuple[int, int], Chosen]
+    ) -> Estimate:
+        """Give an estimate's start from a state of that time, broad. shaking: as learned. given: the lights to use."""
+        learned = REPLAY_SIGMAS * np.sqrt(np.diag(estimate.covariance))
+        place = REPLAY_SIGMAS * np.sqrt(np.diag(place_covariance(estimate.state, estimate.covariance)))
+        range_m = float(np.linalg.norm(state.r_m))
+        untold, variances = constants_of(self.nodes, state.R, state.r_m, self.clock_sigma_s)
+        # What was learned of the constants is learned anew: the same lights must not count twice.
+        state = untold.moved(state.r_m, state.v_mps, state.R)
+        P = np.diag(variances)
+        P[R_, R_] = np.diag(np.maximum(place, REPLAY_SHARE * range_m) ** 2)
+        level = REPLAY_RAD**2 * np.eye(3)
+        P[PHI[0], PHI[0]] = P[PHI[0], PHI[1]] = P[PHI[1], PHI[0]] = level
+        P[PHI[1], PHI[1]] = level + np.diag(np.maximum(learned[PHI[1]], REPLAY_RAD) ** 2)
+        begun = Estimate(
+            estimate.start_s,
+            state,
+            of_place(state, P),
+            estimate.start_s,
+            given=given,
+            searched=True,
+            shaking=shaking,
+            detection=estimate.detection.copy(),
+        )
+        self._open(begun)
+        return begun
 
     def _rewound(self, estimate: Estimate, to_s: float) -> State:
         """Give the state at an earlier time: the samples, taken off again."""

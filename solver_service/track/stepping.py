@@ -153,6 +153,12 @@ class TrackSteps(TrackIntake):
         self._keep_s = keep_s
         self._ports = np.stack([node.rig.depth_port_m for node in nodes])
 
+    def guide_by(self, path: Path) -> None:
+        """Tell what a pass knew at each picture."""
+        for step, looks in enumerate(path.looks):
+            for look in looks:
+                self.guides[look.node, look.stamp_ns] = PassGuide(path, step, look)
+
     def increments(self, estimate: Estimate, t_s: float) -> Increments:
         """Integrate both nodes from the estimate's time to t_s."""
         return increments(self.samples, estimate.state, estimate.t_s, t_s, by_shares=estimate.learns)
@@ -427,11 +433,7 @@ class TrackSteps(TrackIntake):
 
     def _update_lights(self, estimate: Estimate, found: Association, y: Floats, H: Floats, sight: Sight) -> None:
         rows_H, rows_y, noise = _rows(found.chosen, y, H)
-        if estimate.searched and not estimate.confirmed:
-            _, log_det = np.linalg.slogdet(rows_H @ estimate.covariance @ rows_H.T + noise)
-            estimate.fit -= 0.5 * float(log_det)
         chi2 = self._apply(estimate, rows_H, rows_y, noise, teaches=True)
-        estimate.fit -= 0.5 * chi2
         estimate.surprise += chi2
         estimate.told += len(rows_y)
         estimate.light_s = max(estimate.light_s, sight.t_s)

@@ -95,6 +95,15 @@ def test_a_younger_start_that_explains_the_pictures_better_replaces_a_live_track
     assert share > 0.3
 
 
+def test_the_replay_of_a_start_decides_the_lights_again() -> None:
+    """Lights that are left out because a start has drifted off leave too little for a replay with the others."""
+    wrong, share = simulated(
+        Scenario("lake", seed=2147, start_ns=EPOCH_NS, inertial="poor", dead_lamps=("a.right",)), 6.0, "filter"
+    )
+    assert wrong == 0
+    assert share > 0.15
+
+
 @pytest.mark.slow
 def test_a_second_pass_that_the_dive_s_beginning_leads_astray_begins_with_the_first_pass() -> None:
     """The first start is 11 s late, and what is carried back from it is off by half the range: there was no row."""
