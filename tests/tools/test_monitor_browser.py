@@ -128,6 +128,12 @@ BEYOND_SCREEN = """() => [...document.querySelectorAll(".figure .big, .figure .b
     each => Math.max(each.scrollWidth, each.getBoundingClientRect().right) > innerWidth).map(each => each.outerHTML)"""
 BEYOND_PAPER = """() => [...document.querySelectorAll("td, th, p, svg, img, canvas")].filter(
     each => each.getBoundingClientRect().right > innerWidth + 1).map(each => each.outerHTML.slice(0, 99))"""
+# A cell of more lines than words.
+BROKEN_NAMES = """() => [...document.querySelectorAll("td:first-child")].filter(each => {
+    const text = document.createRange();
+    text.selectNodeContents(each);
+    return text.getClientRects().length > each.textContent.split(" ").length;
+}).map(each => each.textContent)"""
 # How long the page's thread is held: long enough for a loaded machine to film the end of green within it.
 HELD_S = 20.0
 FIGURE_PX = """() => [...document.querySelectorAll("#figures .big")].map(
@@ -295,4 +301,7 @@ def test_a_report_is_read_without_a_network(chromium: Any, tmp_path: Path, size:
         seen.page.set_viewport_size({"width": 718, "height": 1000})
         assert seen.page.evaluate(GROUND) == light
         assert seen.page.evaluate(BEYOND_PAPER) == []
+        # What is turned with the mouse is not printed, and no word of a table's names is broken.
+        assert not seen.page.locator("#replay").is_visible()
+        assert seen.page.evaluate(BROKEN_NAMES) == []
         seen.check_clean("file:///")

@@ -50,8 +50,8 @@ CSS: Final = (
     "touch-action:none;border-radius:4px;cursor:grab}"
     ".bar{display:flex;gap:8px;align-items:center;flex-wrap:wrap;margin:6px 0}.bar input{flex:1;min-width:120px}"
     ".bar output{min-width:13em;font-variant-numeric:tabular-nums}"
-    "@media print{.bar{display:none}.wide{min-width:0}.two{grid-template-columns:1fr 1fr}.cam{break-inside:avoid}}"
-    + STRIP_CSS
+    "@media print{.live,.bar{display:none}.wide{min-width:0}.two{grid-template-columns:1fr 1fr}.cam{break-inside:avoid}"
+    "td:first-child{min-width:8em}}" + STRIP_CSS
 )
 
 
@@ -97,7 +97,7 @@ def report_html(
         section("Figures", _figures(numbers)),
         section("Methods", methods_html(numbers, summary)),
         section("Where the error of a place comes from", budget_html(numbers)),
-        section("Replay", _replay(summary)),
+        f'<div class="live">{section("Replay", _replay(summary))}</div>',
         section("Plan and profile", _maps(summary)),
         *_seen_volume(dive),
         section("Over time", f'<div class="scroll"><div class="wide">{_over_time(summary)}</div></div>'),
