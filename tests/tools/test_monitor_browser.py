@@ -244,6 +244,19 @@ def test_everyone_can_use_it_in_every_layout(chromium: Any, processes: Processes
         context.close()
 
 
+def test_on_a_phone_every_figure_of_the_deck_is_seen(chromium: Any, processes: Processes, tmp_path: Path) -> None:
+    port = free_port()
+    processes.start("view", "view", dive_log(tmp_path), "--port", str(port))
+    wait_for_server(f"http://127.0.0.1:{port}")
+    with looking(chromium, "deck", "phone") as seen:
+        seen.page.goto(f"http://127.0.0.1:{port}?deck")
+        seen.wait_for("is 1 sd")
+        assert min(seen.page.evaluate(FIGURE_PX)) >= 80
+        # Without attitudes the range alone has its sigma below it; there is room for three such figures.
+        box = box_of(seen.page.locator(".figure").first)
+        assert box["y"] + 3 * box["height"] <= SIZES["phone"][1]
+
+
 def test_fields_of_messages_are_plotted_beside_each_other(chromium: Any, processes: Processes, tmp_path: Path) -> None:
     port = free_port()
     processes.start("view", "view", dive_log(tmp_path), "--port", str(port))
