@@ -11,7 +11,7 @@ from buddyline.solver_service.geometry.rotation import Floats
 DARK_S: Final = 6.0
 DARK_PICTURES: Final = 15
 # From here on it is worth a word where there is no pose.
-UNSEEN_S: Final = 1.0
+UNSEEN_S: Final = 0.4
 UNSEEN_PICTURES: Final = 5
 # A lamp that is seen makes up for so many pictures without it; a false candidate in its place does no more.
 SIGHTING: Final = 5

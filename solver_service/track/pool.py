@@ -53,7 +53,7 @@ class TrackPool(TrackSteps):
         self.challengers: list[Estimate] = []
         self.restarts = self.searches = True
         self._sights: deque[tuple[float, Sight]] = deque()
-        self._searched_s = -np.inf
+        self._searched_s, self._searched_of = -np.inf, 1
         self._fix_s = -np.inf
 
     def _estimates(self) -> list[Estimate]:
@@ -147,7 +147,9 @@ class TrackPool(TrackSteps):
         every_s = SEARCH_EVERY_S
         if self.main and self.main.confirmed:
             every_s = SEARCH_BESIDE_S if max(self.main.missed) > ONE_SIDED and min(self.main.missed) == 0 else math.inf
-        if not (self.restarts and self.searches) or t_s - self._searched_s < every_s:
+        # Of both nodes in turn: one of them sees a single light where a lamp of the other is dead.
+        again = sight.node == self._searched_of
+        if not (self.restarts and self.searches) or t_s - self._searched_s < (2 if again else 1) * every_s:
             return
         if self._fix_s == -np.inf:
             self._fix_s = t_s - SEARCH_AFTER_S + 0.5
@@ -156,7 +158,7 @@ class TrackPool(TrackSteps):
         of_a, of_b = (newest_before(of_node, t_s + HOLD_S) for of_node in self.attitudes)
         if of_a is None or of_b is None or max(t_s - of_a[0], t_s - of_b[0]) > 0.2:
             return
-        self._searched_s = t_s
+        self._searched_s, self._searched_of = t_s, sight.node
         attitudes = of_a[1], of_b[1]
         for state, P, lights in starts(self.nodes, sight, attitudes, self.clock_sigma_s):
             estimate = Estimate(

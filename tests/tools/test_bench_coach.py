@@ -15,16 +15,8 @@ from buddyline.tools.bench.coach import (
     CASES,
     DIVES,
     NEVER,
-    RAMP_S,
-    SEEN_SHARE,
-    START_NS,
-    TICK_S,
-    TURN_DEGPS,
     WATERS,
     WITHIN_S,
-    Murky,
-    SteeredDive,
-    Steering,
     asked_for,
     beginning,
     fade,
@@ -32,6 +24,17 @@ from buddyline.tools.bench.coach import (
     lamps_in_view,
     lose,
     missing,
+    some_lamp,
+)
+from buddyline.tools.bench.steering import (
+    RAMP_S,
+    SEEN_SHARE,
+    START_NS,
+    TICK_S,
+    TURN_DEGPS,
+    Murky,
+    SteeredDive,
+    Steering,
 )
 
 
@@ -72,6 +75,22 @@ def test_before_the_first_fix_the_words_lead_to_one(case: str) -> None:
     counted = [follow(dive) for dive in dives if dive is not None]
     assert len(counted) >= 2
     assert sum(time_s <= WITHIN_S for time_s in counted) >= 0.9 * len(counted)
+
+
+@pytest.mark.parametrize("seed", [8800, 8804])
+def test_a_lamp_that_is_dark_from_the_start_is_named_whichever_node_has_it(seed: int) -> None:
+    dive = lose("cavern", f"{NEVER}a lamp is dark", seed, imu=True)
+    assert dive is not None
+    assert some_lamp(seed) == {8800: "a.left", 8804: "b.left"}[seed]
+    assert follow(dive) <= WITHIN_S
+    assert not dive.scenario.dead_lamps
+
+
+@pytest.mark.slow
+def test_a_lamp_that_goes_out_while_none_looks_is_named_in_time() -> None:
+    found = fade(DIVES[1], "night_reef", 2001, imu=True, turn_degps=TURN_DEGPS)
+    assert found is not None
+    assert follow(found[0]) <= WITHIN_S
 
 
 def test_a_dive_begins_without_a_fix_as_its_case_says() -> None:

@@ -8,9 +8,8 @@ Once no trigger has given a pose for two seconds, each diver does what the solve
 something new, REACTION_S after it. An amount counts from where the diver was when it came. A fix is a right pose:
 within a tenth of the range of the truth.
 
-Swimming: Dwyer and Lanphier, Oxygen Consumption in Underwater Swimming, 1954: 0.8 to 0.9 knot is normal. Reaction:
-Green, How Long Does It Take to Stop?, 2000: 0.7 to 0.75 s to what is expected. No figure of how fast a diver turns was
-found; 45 degrees a second is an assumption (`--turn`).
+How fast divers swim and turn: `steering`. Reaction: Green, How Long Does It Take to Stop?, 2000: 0.7 to 0.75 s to what
+is expected.
 """
 
 from __future__ import annotations
@@ -21,38 +20,38 @@ import re
 import statistics
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
-from buddyline.node.sim import candidates, rotation
-from buddyline.node.sim.dive import ATTITUDE_NS, BOOT, DEPTH_NS, IMU_NS
-from buddyline.node.sim.glow import SCALE_PX, stands_out
+from buddyline.node.sim import candidates
 from buddyline.node.sim.rotation import Vector
-from buddyline.node.sim.scenario import Environment, Scenario, Water
-from buddyline.node.sim.scene import Lamp, Scene
-from buddyline.node.sim.trajectory import NodesMotion, PairMotion, Placement
+from buddyline.node.sim.scenario import Environment, Scenario
+from buddyline.node.sim.scene import Scene
+from buddyline.node.sim.trajectory import PairMotion
 from buddyline.node.sim.world import World
-from buddyline.protocol.clock import MS_NS, S_NS
+from buddyline.protocol.clock import S_NS
 from buddyline.protocol.health import NO_POSE_S
-from buddyline.protocol.messages import Message, RelativePose
-from buddyline.solver_service.config import SolveConfig
-from buddyline.solver_service.core import SolverCore
-from buddyline.solver_service.tracking import TrackSettings
+from buddyline.tools.bench.steering import (
+    RAMP_S,
+    SEEN_SHARE,
+    START_NS,
+    SWIM_MPS,
+    TICK_S,
+    TURN_DEGPS,
+    Murky,
+    SteeredDive,
+    Steering,
+)
 from buddyline.tools.measure.tables import text_table
 
 CASES: Final = (
     *("one turns away", "both turn away", "one looks up or down", "B drifts off"),
     *("never: a lamp beyond each border", "never: one looks away", "never: one looks up or down"),
-    *("never: both look away", "never: too far", "never: too near"),
+    *("never: both look away", "never: too far", "never: too near", "never: a lamp is dark"),
 )
 DIVES: Final = ("a dive", "a dive in which a lamp goes out", "a dive in silt", "a dive out of sight")
 NEVER: Final = "never: "
 WATERS: Final[tuple[Environment, ...]] = ("cavern", "night_reef", "lake", "basin")
-START_NS: Final = 1_764_000_000 * S_NS
-TICK_NS: Final = S_NS // 10
-TICK_S: Final = TICK_NS / S_NS
 # A fix counts if it comes within this time after the first words.
 WITHIN_S: Final = 5.0
 # So long the divers swim undisturbed before one turns away.
@@ -63,23 +62,16 @@ LOSE_WITHIN_S: Final = 40.0
 WATCHED_S: Final = 2.0
 TRIES: Final = 40
 REACTION_S: Final = 0.7
-TURN_DEGPS: Final = 45.0
-SWIM_MPS: Final = 0.44
 # The status comes once a second, and sooner where the words have changed, as the live solver looks.
 STATUS_S: Final = 1.0
 CHANGED_S: Final = 0.5
-# A pose further from the truth than this share of the range is no fix.
-RIGHT_SHARE: Final = 0.1
 # Out of sight is beyond the longest range of the water's dives; in silt beyond this, with so many specks.
 SILT_M: Final = 5.0
 SILT_LIGHTS: Final = 12
-SEEN_SHARE: Final = 0.7
 # In dives, both stay as they are from this time without a pose on.
 STAYS_S: Final = 1.0
 LEAD_S: Final = 6.0
 DIVE_S: Final = 120.0
-# In this time a diver reaches a rate, and gives it up.
-RAMP_S: Final = 0.4
 # A diver who is told that a lamp is dark takes so long to light it.
 SWITCH_S: Final = 2.0
 
@@ -91,154 +83,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-imu", action="store_true", help="nodes have attitude and depth, no inertial samples")
     parser.add_argument("--seed", type=int, default=1, help="default: 1")
     parser.add_argument("--turn", type=float, default=TURN_DEGPS, metavar="DEG", help="a second; default: %(default)g")
-
-
-@dataclass(frozen=True)
-class Murky(Scenario):
-    """A dive in water that is so thick that a lamp is seen from SEEN_SHARE of the longest range."""
-
-    @property
-    def water(self) -> Water:
-        """Optics of the environment."""
-        return thickened(super().water, SEEN_SHARE * self.far_m)
-
-
-@lru_cache
-def thickened(water: Water, seen_m: float) -> Water:
-    """Return water of which as much more is dissolved and stirred up that a lamp is just not seen at seen_m."""
-    on_axis = np.array((0.0, 0.0, 1.0))
-    lamp = Lamp(seen_m * on_axis, -on_axis, np.zeros(2), 1.0, math.radians(12.0))
-    thick = 1.0
-    while stands_out(lamp, water_of(water, thick), SCALE_PX):
-        thick *= 1.05
-    return water_of(water, thick)
-
-
-def water_of(water: Water, thick: float) -> Water:
-    """Return water with its absorption and scattering multiplied."""
-    (b, g, r), (sb, sg, sr) = water.absorption_per_m, water.scattering_per_m
-    absorption, scattering = (thick * b, thick * g, thick * r), (thick * sb, thick * sg, thick * sr)
-    return replace(water, absorption_per_m=absorption, scattering_per_m=scattering)
-
-
-class Stayed(NodesMotion):
-    """A motion that comes to rest once its nodes are told to stay."""
-
-    def __init__(self, base: NodesMotion) -> None:
-        self._base = base
-        self.stays_s = math.inf
-
-    def placement(self, index: int, t_s: float) -> Placement:
-        """Return where a node is at t_s."""
-        over_s = max(t_s - self.stays_s, 0.0)
-        return self._base.placement(index, t_s - over_s + RAMP_S * -math.expm1(-over_s / RAMP_S))
-
-
-class Steering(NodesMotion):
-    """A motion, and what the divers add to it: A's turn right and down, B's turn right and down, B's way away from A.
-
-    begin (5,): what is added from the start on. rates (5,): of what is added, deg/s and m/s; most (5,): the greatest.
-    They change as smoothly as divers can change them.
-    """
-
-    def __init__(
-        self, base: NodesMotion, begin: Vector | None = None, turn_degps: float = TURN_DEGPS, since_s: float = 0.0
-    ) -> None:
-        self._base = base
-        self.most = np.array([turn_degps] * 4 + [SWIM_MPS])
-        self._since_s = self._until_s = since_s
-        self._pieces = [(0.0, np.zeros(5) if begin is None else begin, np.zeros(5), np.zeros(5))]
-        self.rates = np.zeros(5)
-
-    def steer(self, wanted: Vector) -> None:
-        """Go on by a tick, toward these rates."""
-        _, value, rates, change = self._pieces[-1]
-        value, rates = value + rates * TICK_S + change * TICK_S**2 / 2, rates + change * TICK_S
-        most = self.most / RAMP_S
-        self._pieces.append((self._until_s, value, rates, np.clip((wanted - rates) / TICK_S, -most, most)))
-        self._until_s += TICK_S
-        self.rates = rates
-
-    def added(self, t_s: float) -> Vector:
-        """Return what has been added at t_s."""
-        begin_s, value, rates, change = self._pieces[
-            min(max(int((t_s - self._since_s) / TICK_S) + 1, 0), len(self._pieces) - 1)
-        ]
-        since_s = max(t_s - begin_s, 0.0)
-        added: Vector = value + rates * since_s + change * since_s**2 / 2
-        return added
-
-    def placement(self, index: int, t_s: float) -> Placement:
-        """Return where a node is at t_s."""
-        placed, added = self._base.placement(index, t_s), self.added(t_s)
-        right_rad, down_rad = np.radians(added[2 * index : 2 * index + 2]).tolist()
-        R = rotation.from_euler(0.0, 0.0, right_rad) @ placed.R_ned_body @ rotation.from_euler(0.0, -down_rad, 0.0)
-        position_m = placed.position_ned_m
-        if index == 1:
-            sight_m = (position_m - self._base.placement(0, t_s).position_ned_m) * (1.0, 1.0, 0.0)
-            position_m = position_m + added[4] * sight_m / np.linalg.norm(sight_m)
-        return Placement(R, position_m)
-
-
-class SteeredDive:
-    """A simulated dive that goes on tick by tick, with the solver that sees it."""
-
-    def __init__(
-        self,
-        scenario: Scenario,
-        *,
-        imu: bool,
-        begin: Vector | None = None,
-        turn_degps: float = TURN_DEGPS,
-        since_s: float = 0.0,
-    ) -> None:
-        self.base = Stayed(PairMotion(scenario))
-        self.motion = Steering(self.base, begin, turn_degps, since_s)
-        self.scenario = scenario
-        self._world, self._imu, self._seq = World(scenario, self.motion), imu, 0
-        settings = TrackSettings(modes=frozenset(("filter",)), rate_hz=20.0)
-        self._core = SolverCore(SolveConfig().settings("bench"), [("a", "b")], track=settings)
-        for node in "ab":
-            self._core.handle(self._world.info(node, START_NS, TICK_NS))
-        self.now_ns = self.posed_ns = self.since_ns = START_NS + round(since_s / TICK_S) * TICK_NS
-
-    @property
-    def t_s(self) -> float:
-        """Seconds since the start."""
-        return (self.now_ns - self.since_ns) / S_NS
-
-    def tick(self, wanted: Vector) -> None:
-        """Go on by a tick; wanted: rates of steering."""
-        self.motion.steer(wanted)
-        end_ns = self.now_ns + TICK_NS
-        said: list[Message] = []
-        for node in "ab":
-            said += [self._world.attitude(node, ns) for ns in range(self.now_ns + ATTITUDE_NS, end_ns + 1, ATTITUDE_NS)]
-            said += [self._world.depth(node, ns) for ns in range(self.now_ns + DEPTH_NS, end_ns + 1, DEPTH_NS)]
-            if self._imu:
-                said += [self._world.imu(node, ns) for ns in range(self.now_ns + 3 * MS_NS, end_ns, IMU_NS)]
-            said.append(self._world.candidates(node, end_ns, end_ns // TICK_NS, self._seq, BOOT))
-        self._seq += 1
-        self.now_ns = end_ns
-        poses = [one for one in self._core.handle_many(said) if isinstance(one, RelativePose)]
-        self.posed_ns = max([self.posed_ns, *(pose.stamp_ns for pose in poses if self._is_right(pose))])
-
-    def put_out(self, *lamps: str) -> None:
-        """Go on with these lamps dark, such as `a.left`; with none, all are lit."""
-        self.scenario = replace(self.scenario, dead_lamps=lamps)
-        self._world = World(self.scenario, self.motion)
-
-    def _is_right(self, pose: RelativePose) -> bool:
-        t_m = np.array(self._world.truth(pose.stamp_ns, pose.trigger).t_a_b_m)
-        return bool(np.linalg.norm(pose.t_a_b_m - t_m) < RIGHT_SHARE * np.linalg.norm(t_m))
-
-    def without_s(self) -> float:
-        """Return the time since the last pose."""
-        return (self.now_ns - self.posed_ns) / S_NS
-
-    def advice(self) -> list[str]:
-        """Return what the solver's status says now."""
-        return self._core.pairs["a", "b"].advice()
 
 
 def asked_for(words: list[str]) -> Vector:
@@ -283,6 +127,11 @@ def dived(case: str, environment: Environment, seed: int) -> Scenario:
     return found
 
 
+def some_lamp(seed: int) -> str:
+    """Return the lamp that is dark in a case: each of the four in turn, in each water."""
+    return f"{'ab'[seed // 4 % 2]}.{('left', 'right')[seed // 8 % 2]}"
+
+
 def missing(scene: Scene, t_s: float) -> list[str]:
     """Return why lamps are not seen, a word for each that is not."""
     words = []
@@ -309,7 +158,7 @@ def fade(
     """Return a dive whose divers have lost the fix as dives do, and why; None if they have not."""
     scenario = dived(case, environment, seed)
     scene, since_s, dark = Scene(scenario), 0.0, 0
-    lamp = f"{'ab'[seed // 4 % 2]}.{('left', 'right')[seed // 8 % 2]}" if case.endswith("out") else ""
+    lamp = some_lamp(seed) if case.endswith("out") else ""
     # A lamp goes out in the midst of a dive, or as soon as there is no pose.
     while dark < STAYS_S / TICK_S and not (lamp and since_s > DIVE_S / 4):
         since_s += TICK_S
@@ -342,6 +191,8 @@ def beginning(environment: Environment, case: str, seed: int, rng: np.random.Gen
     one, side = int(rng.integers(2)), rng.choice((-1.0, 1.0), 2)
     for k in range(TRIES):
         begin = np.zeros(5)
+        if case.endswith("dark"):
+            return begin if lamps_in_view(environment, seed, begin) == [2, 2] else None
         if case.endswith("border"):
             begin[[0, 2]] = side * k
         elif case.endswith("one looks away"):
@@ -371,6 +222,8 @@ def lose(
         if begin is None:
             return None
         dive = SteeredDive(scenario, imu=imu, begin=begin, turn_degps=turn_degps)
+        if case.endswith("dark"):
+            dive.put_out(some_lamp(seed))
         while dive.t_s < WATCHED_S:
             dive.tick(still)
         return dive if dive.posed_ns == START_NS else None
