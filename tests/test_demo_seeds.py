@@ -5,7 +5,7 @@ from dataclasses import replace
 from buddyline.node.sim.scenario import ENVIRONMENTS, Scenario
 from buddyline.node.sim.world import World
 
-from tests.demo_seeds import START_NS, dives, judged, swum
+from tests.demo_seeds import START_NS, dives, judged, swum, told_track
 
 
 def test_nothing_is_wrong_in_a_dive_of_the_demo_but_much_against_anothers_truth():
@@ -13,12 +13,15 @@ def test_nothing_is_wrong_in_a_dive_of_the_demo_but_much_against_anothers_truth(
     outcomes = swum(World(scenario), 2.0)
     dive = judged(World(scenario), outcomes)
     assert dive.poses >= 15
-    assert set(dive.samples) == {"filter", "lag", "smooth"}
-    assert min(dive.samples.values()) >= 20
+    assert set(dive.tracks) == {"filter", "lag", "smooth"}
+    assert min(figures.samples for figures in dive.tracks.values()) >= 20
     assert dive.wrong == 0
     other = judged(World(replace(scenario, seed=5)), outcomes)
     assert other.wrong_poses
-    assert all(other.wrong_samples.values())
+    assert all(figures.wrong for figures in other.tracks.values())
+    lag = other.tracks["lag"]
+    assert told_track([lag, lag]).startswith(f"{2 * lag.wrong} of {2 * lag.samples} (")
+    assert told_track([lag, lag]).endswith(f"NEES/6 {lag.nees6.mean / 6:.2f})")
 
 
 def test_each_seed_comes_in_one_water_first_then_in_the_others():
