@@ -11,16 +11,16 @@ from typing import Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.messages import Attitude, Message, NodeInfo, NodePose, Rejected, RelativePose, TrackMode
-from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix, rotation_exp
+from buddyline.protocol.messages import Message, NodeInfo, NodePose, Rejected, RelativePose, TrackMode
+from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
 from buddyline.solver_service.network.belief import KnownPlace
 from buddyline.solver_service.network.estimate import NetRow
 from buddyline.solver_service.network.filter import NetFilter
 from buddyline.solver_service.results import NUMERIC_ERRORS, view_of
 from buddyline.solver_service.streams import STOPPED_NS, NodeStream
-from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen
+from buddyline.solver_service.track.inputs import DepthSeen
 from buddyline.solver_service.track.problems import as_ended
-from buddyline.solver_service.tracking import TrackSettings, fix_of, frame_of, same_rig, track_node_of
+from buddyline.solver_service.tracking import TrackSettings, attitudes_of, fix_of, frame_of, same_rig, track_node_of
 from msgspec import UNSET
 
 NET: Final = "main"
@@ -197,20 +197,13 @@ class NetTracker:
     def _feed(self, track: NetFilter, index: int, stream: NodeStream, start_ns: int, end_ns: int) -> None:
         stamps_ns, values = stream.imu.between(start_ns, end_ns)
         track.add_imu(index, stamps_ns, values[:, :3], values[:, 3:])
-        for attitude in stream.attitude.between(start_ns, end_ns):
-            track.add_attitude(index, self._attitude(attitude, index))
+        first, own = track.nodes[0].rig, track.nodes[index].rig
+        for attitude in attitudes_of(stream.attitude.between(start_ns, end_ns), first, own):
+            track.add_attitude(index, attitude)
         for depth in stream.depth.between(start_ns, end_ns):
             track.add_depth(index, DepthSeen(depth.stamp_ns, depth.depth_m, depth.sigma_m))
         for frame in stream.frames.between(start_ns, end_ns):
             track.add_frame(index, frame_of(view_of(frame)))
-
-    def _attitude(self, message: Attitude, index: int) -> AttitudeSeen:
-        """Return an attitude relative to the first node's north: the nodes' declinations may differ."""
-        R = quat_to_matrix(np.array(message.q_ned_body_xyzw))
-        first, own = (self._infos[self._nodes[i]].declination_rad for i in (0, index))
-        if first != own:
-            R = rotation_exp(np.array([0.0, 0.0, first - own])) @ R
-        return AttitudeSeen(message.stamp_ns, R, np.array(message.sigma_rad))
 
     def _message(self, row: NetRow) -> NodePose:
         node = self._nodes[row.node]

@@ -146,7 +146,9 @@ class ImuWindow:
         self._stamps[at] = sample.stamp_ns
         self._values[at] = (*sample.accel_mps2, *sample.gyro_radps)
         self._end += 1
-        self._start = max(self._start, self._end - MAX_SAMPLES, self._place(int(self._stamps[self._end - 1]) - KEPT_NS))
+        oldest_ns = self._stamps[self._end - 1] - KEPT_NS
+        while self._stamps[self._start] < oldest_ns or len(self) > MAX_SAMPLES:
+            self._start += 1
 
     def between(self, start_ns: int, end_ns: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the samples from start_ns to end_ns, both included: stamps (N,), and (N, 6) m/s^2 and rad/s."""

@@ -330,6 +330,7 @@ class PairTracker:
         if self._nodes is None:
             raise RuntimeError("no calibration yet")
         stamps_ns, values = stream.imu.between(start_ns, end_ns)
+        first, own = self._nodes[0].rig, self._nodes[node].rig
         return NodeRecord(
             node=self._nodes[node],
             # In pictures of nodes that look apart the track would only find wrong starts.
@@ -341,20 +342,11 @@ class PairTracker:
             imu_stamps_ns=stamps_ns,
             accel_mps2=values[:, :3],
             gyro_radps=values[:, 3:],
-            attitudes=[self._attitude(each, node) for each in stream.attitude.between(start_ns, end_ns)],
+            attitudes=attitudes_of(stream.attitude.between(start_ns, end_ns), first, own),
             depths=[
                 DepthSeen(each.stamp_ns, each.depth_m, each.sigma_m) for each in stream.depth.between(start_ns, end_ns)
             ],
         )
-
-    def _attitude(self, message: Attitude, node: int) -> AttitudeSeen:
-        """Return an attitude from the north of A's attitudes, which B's may have another declination for."""
-        R = quat_to_matrix(np.array(message.q_ned_body_xyzw))
-        if node == 1 and self._nodes is not None:
-            a, b = (each.rig.declination_rad for each in self._nodes)
-            if a != b:
-                R = rotation_exp(np.array([0.0, 0.0, a - b])) @ R
-        return AttitudeSeen(message.stamp_ns, R, np.array(message.sigma_rad))
 
     def _note(self, problems: Iterable[str]) -> None:
         self._past += [problem for problem in problems if problem not in self._past]
@@ -420,6 +412,18 @@ def frame_of(view: View) -> FrameSeen:
     """Return a frame as the track and the network take it."""
     dt_ns = np.rint(view.dt_s * S_NS).astype(np.int64)
     return FrameSeen(view.stamp_ns, view.pixels, view.sigma_px, dt_ns, view.elsewhere)
+
+
+def attitudes_of(messages: Sequence[Attitude], first: Rig, own: Rig) -> list[AttitudeSeen]:
+    """Return a node's attitudes from the north of the first node's, which may have another declination."""
+    if not messages:
+        return []
+    R = quat_to_matrix(np.array([message.q_ned_body_xyzw for message in messages]))
+    if first.declination_rad != own.declination_rad:
+        R = rotation_exp(np.array([0.0, 0.0, first.declination_rad - own.declination_rad])) @ R
+    sigmas_rad = np.array([message.sigma_rad for message in messages])
+    stamps_ns = [message.stamp_ns for message in messages]
+    return list(map(AttitudeSeen, stamps_ns, R, sigmas_rad))
 
 
 def fix_of(pose: RelativePose) -> FixSeen:

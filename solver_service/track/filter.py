@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import math
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -59,8 +60,20 @@ APART_S: Final = 20.0
 FAR_SIGMAS: Final = 6.0
 # Longest step, without a picture, over which a track tells its present state.
 BRIDGED_S: Final = 1.0
+# The present is told by a row that is no more than this before it.
+LITTLE_S: Final = 0.01
 # Messages older than this are dropped. The noise of slow sensors is learned from so much.
 MEMORY_S: Final = 30.0
+
+
+@dataclass(frozen=True, eq=False)
+class Present:
+    """A track at one time: its state, covariance (SIZE, SIZE) and turn rates (2, 3)."""
+
+    t_s: float
+    state: State
+    covariance: Floats
+    rates_radps: Floats
 
 
 class TrackFilter(TrackPool):
@@ -78,6 +91,7 @@ class TrackFilter(TrackPool):
         self._waiting: list[Estimate] = []
         self._refused = 0
         self._apart_s = -np.inf
+        self._last_row: tuple[Estimate, Present] | None = None
 
     def advance(self, to_ns: int, outputs_ns: list[int] | None = None) -> list[TrackRow]:
         """Go on to to_ns, up to which all has been added; return the track at the asked stamps in between.
@@ -105,19 +119,24 @@ class TrackFilter(TrackPool):
         self._forget_before(end_s - MEMORY_S)
         return rows
 
-    def present(self, t_s: float) -> tuple[State, Floats, Floats] | None:
-        """Return the confirmed track's state, covariance and turn rates (2, 3) at t_s, up to which all has been added.
+    def present(self, t_s: float) -> Present | None:
+        """Return the confirmed track at t_s, up to which all has been added, or at a row so little before.
 
         None where there is no such track, or it ends before.
         """
         main = self.main
         if main is None or not main.confirmed or self.doubted() or not 0.0 <= t_s - main.t_s < BRIDGED_S:
             return None
-        if t_s <= main.t_s:
-            return main.state, main.covariance, main.rates_radps
-        parts = self.increments(main, t_s)
-        state, P = self._predict(main, t_s, parts=parts)
-        return state, P, parts.rate_radps
+        row = self._last_row
+        if row is not None and row[0] is main and max(main.t_s, t_s - LITTLE_S) <= row[1].t_s <= t_s:
+            return row[1]
+        return self._present(main, t_s)
+
+    def _present(self, estimate: Estimate, t_s: float) -> Present:
+        if t_s <= estimate.t_s:
+            return Present(estimate.t_s, estimate.state, estimate.covariance, estimate.rates_radps)
+        parts = self.increments(estimate, t_s)
+        return Present(t_s, *self._predict(estimate, t_s, parts=parts), parts.rate_radps)
 
     def doubted(self) -> bool:
         """Whether a live track is not to be told; `problems` says why.
@@ -343,13 +362,13 @@ class TrackFilter(TrackPool):
             return None
         while t_s - main.t_s > 1.5 * TICK_S:
             self._step(main, main.t_s + TICK_S, None)
-        state, P = self._predict(main, t_s)
-        lights = np.array((main.lights,))
+        row = self._present(main, t_s)
+        self._last_row = main, row
         return rows_of(
             (stamp_ns,),
-            State.of_row(state.to_row()[None]),
-            P[BLOCK][None],
+            State.of_row(row.state.to_row()[None]),
+            row.covariance[BLOCK][None],
             main.rates_radps[None],
-            lights,
+            np.array((main.lights,)),
             np.array((t_s - main.light_s,)),
         )[0]

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
-from buddyline.solver_service.track.filter import TrackFilter
+from buddyline.solver_service.track.filter import Present, TrackFilter
 from buddyline.solver_service.track.lights import BLOCK, in_picture, light_positions, pixel_of
-from buddyline.solver_service.track.state import State
 from buddyline.solver_service.track.stepping import HOLD_S
 
 # How the nodes may move otherwise than at their last rates, 1 sd: a diver who turns his head, and who swims off.
@@ -44,22 +44,20 @@ def foresee(track: TrackFilter, known_ns: int, stamps_ns: Mapping[int, int]) -> 
     place is poorly known is left out.
     """
     now_s = track.seconds(0, known_ns) - HOLD_S
-    ahead_s = {observer: track.seconds(observer, stamp_ns) - now_s for observer, stamp_ns in stamps_ns.items()}
-    near = {observer: ahead for observer, ahead in ahead_s.items() if 0.0 < ahead <= FURTHEST_S}
+    at_s = {observer: track.seconds(observer, stamp_ns) for observer, stamp_ns in stamps_ns.items()}
+    near = {observer: t_s for observer, t_s in at_s.items() if now_s < t_s <= now_s + FURTHEST_S}
     present = track.present(now_s) if near else None
     if present is None:
         return {}
-    return {observer: _foreseen(track, observer, ahead, present) for observer, ahead in near.items()}
+    return {observer: _foreseen(track, observer, t_s - present.t_s, present) for observer, t_s in near.items()}
 
 
-def _foreseen(
-    track: TrackFilter, observer: int, ahead_s: float, present: tuple[State, Floats, Floats]
-) -> list[ForeseenLight]:
-    state, P, rates_radps = present
+def _foreseen(track: TrackFilter, observer: int, ahead_s: float, present: Present) -> list[ForeseenLight]:
+    P = present.covariance[BLOCK]
     rig, other = track.nodes[observer].rig, track.nodes[1 - observer].rig
     dark = {light for node, light, _ in track.lamps.dark() if node == 1 - observer}
     times_s = np.array((ahead_s, ahead_s + STEP_S))
-    X, D = light_positions(state, observer, other.lights_m, rates_radps, times_s)
+    X, D = light_positions(present.state, observer, other.lights_m, present.rates_radps, times_s)
     found = []
     for light in sorted({0, 1} - dark):
         at, later = (pixel_of(rig.camera, X[k, light]) for k in (0, 1))
@@ -67,12 +65,14 @@ def _foreseen(
             continue
         bearing, tangents = (values[0] for values in rig.camera.rays(at[None]))
         J = tangents @ D[0, light] / float(bearing @ X[0, light])
-        px_per_rad = float(np.linalg.norm(tangents[0]))
-        range_m = float(np.linalg.norm(X[0, light]))
+        px_per_rad = math.hypot(*tangents[0].tolist())
+        range_m = math.hypot(*X[0, light].tolist())
         # Twice the integral of an unknown acceleration: of the turn, and of the way seen from so far.
-        growth = px_per_rad * float(np.hypot(TURN_RADPS2, PUSH_MPS2 / range_m))
-        covariance = J @ P[BLOCK] @ J.T + (0.5 * growth * ahead_s**2) ** 2 * np.eye(2)
-        worst_px2 = float(np.linalg.eigvalsh(covariance)[-1]) if np.isfinite(covariance).all() else np.inf
+        growth = px_per_rad * math.hypot(TURN_RADPS2, PUSH_MPS2 / range_m)
+        covariance = J @ P @ J.T + (0.5 * growth * ahead_s**2) ** 2 * np.eye(2)
+        (uu, uv), (_, vv) = covariance.tolist()
+        # The larger eigenvalue.
+        worst_px2 = 0.5 * (uu + vv) + math.hypot(0.5 * (uu - vv), uv)
         if not 0.0 < worst_px2 < (WORST_SHARE * rig.camera.width_px) ** 2:
             continue
         rate_pxps = (later - at) / STEP_S

@@ -6,6 +6,7 @@ import bisect
 import heapq
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import itemgetter
 from typing import Final, TypeVar
 
 import numpy as np
@@ -26,6 +27,7 @@ UNTOLD_SIGMA_RAD: Final = np.radians((1.5, 1.5, 6.0))
 # No fix's numbers, in m, rad and their squares, are as large.
 BEYOND: Final = 1e4
 Seen = TypeVar("Seen", AttitudeSeen, DepthSeen)
+_time_of: Final = itemgetter(0)
 
 
 class TrackIntake:
@@ -176,10 +178,6 @@ class TrackIntake:
             for items in (self.attitudes[node], self.depths[node]):
                 while len(items) > 1 and items[0][0] < t_s:
                     items.pop(0)
-
-
-def _time_of(item: tuple[float, object]) -> float:
-    return item[0]
 
 
 def newest_before(items: list[tuple[float, Seen]], t_s: float) -> tuple[float, Seen] | None:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 # A position no better than this share of the range is not told.
 WORST_SHARE: Final = 0.2
-# a x b = _ACROSS a b, by its last two axes.
-_ACROSS: Final = -skew(np.eye(3))
+# a x b = _ACROSS (a b^T), the product's nine numbers row by row.
+_ACROSS: Final = -skew(np.eye(3)).reshape(3, 9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +91,11 @@ def _bent(C: Floats) -> Floats:
     would be many sigmas off. For normal errors E[w_j t_k w_m t_n] = W_jk W_mn + E_jm T_kn + W_jn W_mk; W is of (w, t).
     """
     of_t, of_w, both = C[:, :3, :3], C[:, 3:, 3:], C[:, 3:, :3]
-    fourth = np.einsum("ajk,amn->ajkmn", both, both) + np.einsum("ajm,akn->ajkmn", of_w, of_t)
-    fourth += np.einsum("ajn,amk->ajkmn", both, both)
-    bent: Floats = 0.25 * np.einsum("ijk,lmn,ajkmn->ail", _ACROSS, _ACROSS, fourth, optimize=True)
+    # By j, k, m, n; both again with its two axes at j and n, and at m and k.
+    fourth = both[:, :, :, None, None] * both[:, None, None, :, :]
+    fourth += of_w[:, :, None, :, None] * of_t[:, None, :, None, :]
+    fourth += both[:, :, None, None, :] * np.swapaxes(both, 1, 2)[:, None, :, :, None]
+    bent: Floats = 0.25 * (_ACROSS @ fourth.reshape(-1, 9, 9) @ _ACROSS.T)
     return bent
 
 

@@ -94,36 +94,44 @@ class Samples:
         they are not known. known_s: nothing later than this is looked at, so that more samples do not change the
         answer.
         """
-        last = int(np.searchsorted(self.times_s, known_s, side="right"))
-        t, values = self._t[:last], self._values[:last]
-        first, stop = int(np.searchsorted(t, start_s, side="right")), int(np.searchsorted(t, end_s, side="left"))
-        ends = np.array((start_s, end_s))
+        last = int(self.times_s.searchsorted(known_s, side="right"))
         if last == 0 or not self.trusted:
-            return ends, np.zeros((2, 13)), np.zeros(1, dtype=bool)
-        grid = np.concatenate(((start_s,), t[first:stop], (end_s,)))
-        right = np.clip(np.searchsorted(t, ends), 1, max(last - 1, 1))
-        if last == 1:
-            edge = np.stack((values[0], values[0]))
-        else:
-            width = t[right] - t[right - 1]
-            share = np.clip((ends - t[right - 1]) / width, 0.0, 1.0)[:, None]
-            edge = (1.0 - share) * values[right - 1] + share * values[right]
-        at = np.concatenate((edge[:1], values[first:stop], edge[1:]))
+            return np.array((start_s, end_s)), np.zeros((2, 13)), np.zeros(1, dtype=bool)
+        t = self._t[:last]
+        first, stop = int(t.searchsorted(start_s, side="right")), int(t.searchsorted(end_s, side="left"))
+        grid: Floats = np.empty(stop - first + 2)
+        at: Floats = np.empty((stop - first + 2, 13))
+        grid[0], grid[1:-1], grid[-1] = start_s, t[first:stop], end_s
+        at[0], at[-1] = self._interpolated(start_s, first, last), self._interpolated(end_s, stop, last)
+        at[1:-1] = self._values[first:stop]
         # An interval is told where the samples on its two sides are near each other.
-        before = t[np.maximum(np.arange(first - 1, stop), 0)]
-        after = t[np.minimum(np.arange(first, stop + 1), last - 1)]
-        late = np.maximum(grid[1:] - t[last - 1], 0.0) + np.maximum(t[0] - grid[:-1], 0.0)
-        told = (after - before < GAP_S) & (late < 0.5 * GAP_S)
+        sides = t.take(np.arange(first - 1, stop + 1), mode="clip")
+        told: Bools = sides[1:] - sides[:-1] < GAP_S
+        if start_s < t[0] or end_s > t[-1]:
+            late = np.maximum(grid[1:] - t[-1], 0.0) + np.maximum(t[0] - grid[:-1], 0.0)
+            told &= late < 0.5 * GAP_S
         if self.shares.any():
             at[:, :6] -= np.repeat(self.shares, 3) * at[:, 6:12]
         return grid, at, told
+
+    def _interpolated(self, time_s: float, after: int, last: int) -> Floats:
+        """Give the values (13,) at a time before the sample `after`, of the first `last`; beyond them, the nearest."""
+        if last == 1:
+            only: Floats = self._values[0]
+            return only
+        after = min(max(after, 1), last - 1)
+        before_s, after_s = self._t[after - 1 : after + 1].tolist()
+        share = min(max((time_s - before_s) / (after_s - before_s), 0.0), 1.0)
+        value: Floats = (1.0 - share) * self._values[after - 1] + share * self._values[after]
+        return value
 
     def slow_rate(self, time_s: float, known_s: float) -> Floats | None:
         """Give the mean turn rate (3,) of SLOW_S until known_s or shortly after time_s, None where there is none.
 
         Shaking is gone from it, motion is SLOW_S / 2 late in it.
         """
-        first, stop = np.searchsorted(self.times_s, (time_s - SLOW_S, min(time_s + 0.1 * SLOW_S, known_s)))
+        ends_s = time_s - SLOW_S, min(time_s + 0.1 * SLOW_S, known_s)
+        first, stop = self.times_s.searchsorted(ends_s).tolist()
         if stop <= first:
             return None
         return np.asarray(np.add.reduce(self._values[first:stop, 3:6]) / (stop - first))

@@ -135,7 +135,7 @@ def increments(
 def _padded(rows: Sequence[NDArray[Number]]) -> NDArray[Number]:
     """Give nodes' rows (N, M, ...), the last one repeated where another node has more: intervals of no length."""
     most = max(map(len, rows))
-    return np.stack([row if len(row) == most else row[np.minimum(np.arange(most), len(row) - 1)] for row in rows])
+    return np.array([row if len(row) == most else row[np.minimum(np.arange(most), len(row) - 1)] for row in rows])
 
 
 class TrackSteps(TrackIntake):

@@ -181,19 +181,23 @@ def integrate(state: Carried, grid: SampleGrid) -> Increments:
     R, R_mid = orthonormal(R), starts @ halves
     # Once over all that is turned to level: mount, the crosses with rate and force, force.
     inner = np.empty((count, points - 1, 3, 10))
-    inner[..., 0:3], inner[..., 3:6], inner[..., 6:9] = mount[:, None], skew(w_mid), skew(f_mid)
-    inner[..., 9] = f_mid
+    inner[..., 0:3], inner[..., 9] = mount[:, None], f_mid
+    crosses = skew(middle.reshape(count, points - 1, 2, 3))
+    inner[..., 3:6], inner[..., 6:9] = crosses[:, :, 1], crosses[:, :, 0]
     turned = R_mid @ inner
     u = np.where(told[:, :, None], turned[..., 9], _AT_REST_MPS2)
     to_end = t[:, -1:] - 0.5 * (t[:, 1:] + t[:, :-1])
-    weights = np.stack((h, h * to_end), axis=1)
+    weights = np.empty((count, 2, points - 1))
+    weights[:, 0], weights[:, 1] = h, h * to_end
     span = t[:, -1:] - t[:, :1]
     # Where no sample tells, the rates are an attitude filter's: it has a drift, but no mount, delay or lever arm.
-    ends = np.stack((R0, R), axis=1)
+    ends = np.empty((count, 2, 3, 3))
+    ends[:, 0], ends[:, 1] = R0, R
     lever = (state.lever_m * whole)[:, None, :, None]
     arms = (ends @ skew(values[:, [0, -1], 3:]) @ lever)[..., 0]
     placed = (ends @ lever)[..., 0]
-    swept = np.stack((arms[:, 1] - arms[:, 0], placed[:, 1] - placed[:, 0] - arms[:, 0] * span), axis=1)
+    swept = np.empty((count, 2, 3))
+    swept[:, 0], swept[:, 1] = arms[:, 1] - arms[:, 0], placed[:, 1] - placed[:, 0] - arms[:, 0] * span
     gained = weights @ u - swept
 
     # The attitude's error by gyro bias, mount and delay: at the middle of each interval, and at the end.
@@ -346,7 +350,7 @@ def process_noise(
             shaken[k, :NAV] = shaken[k, :, :NAV] = 0.0
     T = invariant_of_plain(after)
     shaken = T @ shaken @ T.T
-    return T @ Q @ T.T + shaken.sum(axis=0), walk[MOVING:], shaken
+    return T @ Q @ T.T + np.add.reduce(shaken), walk[MOVING:], shaken
 
 
 def guessed_noise(parts: Increments, noises: tuple[Noise, Noise], span_s: float, shares: Floats) -> Floats:

@@ -35,7 +35,6 @@ MOST: Final = 2.0 * np.log(10.0 * FIRST)
 WALKS: Final = len(FIRST)
 OF_UNITS: Final = slice(0, 2)
 OF_NODES: Final = slice(2, WALKS)
-_IDENTITY: Final = np.eye(SIZE)
 _BIASES: Final = (GYRO_BIAS, ACCEL_BIAS)
 
 
@@ -111,11 +110,11 @@ class Walking:
         across = self.spread @ H.T
         D = H @ across
         W = S_inverse @ D
-        rest = _IDENTITY - gain @ H
-        moved = rest @ (self.moved + (across @ z).T)
-        less = gain @ np.swapaxes(across, 1, 2)
-        spread = self.spread - less - np.swapaxes(less, 1, 2) + gain @ D @ gain.T
-        # Rounding must not make it asymmetric: that part would grow.
+        moved = self.moved + (across @ z).T
+        moved -= gain @ (H @ moved)
+        # Half of what (I - K H) D (I - K H)^T takes off, the other half is its transpose. Rounding must not make the
+        # rest asymmetric: that part would grow.
+        spread = self.spread + (gain @ D - 2.0 * across) @ gain.T
         spread = 0.5 * (spread + np.swapaxes(spread, 1, 2))
         if not learns:
             return replace(self, spread=spread, moved=moved)
