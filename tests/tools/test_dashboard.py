@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import re
+import sys
+import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +16,7 @@ from buddyline.protocol.codec import encode
 from buddyline.protocol.envelope import open_envelope
 from buddyline.protocol.messages import Message
 from buddyline.protocol.topics import key_of
+from buddyline.tools.demo.command import _show
 from buddyline.tools.demo.dashboard import Dashboard, summary_text
 from buddyline.tools.draw.above import ASCII_ARROWS
 from msgspec.structs import replace
@@ -101,6 +106,25 @@ def test_the_screen_fits_its_terminal(size):
     assert "last without a pose: " in text
     assert "deg  lights: a 2, b 2" in text
     assert ("latency" in text) == (size[1] > 24)
+
+
+class Terminal(io.StringIO):
+    """A terminal that keeps what is written to it."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_screens_follow_each_other_without_a_line_s_end(monkeypatch):
+    """It would move a full screen up by a line, its title out of sight."""
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    assert _show(SimpleNamespace(stop=threading.Event()), running().dashboard, 0.3)
+    text = terminal.getvalue()
+    assert text.count("\x1b[J\x1b[H") >= 1
+    assert text.count("\x1b[J\n") == 1
+    assert text.endswith("\x1b[J\n")
 
 
 def test_colours_are_left_out_where_nobody_wants_them():

@@ -223,13 +223,16 @@ def _show(service: Service, dashboard: Dashboard | TeamDashboard, seconds: float
     interactive = sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
     coloured = not os.environ.get("NO_COLOR")
     arrows = ARROWS if "utf" in (sys.stderr.encoding or "").lower() else ASCII_ARROWS
-    while not service.stop.wait(0.25 if interactive else 1.0):
+    over = False
+    while not over and not service.stop.wait(0.25 if interactive else 1.0):
         size = shutil.get_terminal_size()
         if interactive:
             text = dashboard.screen(size.columns, size.lines, coloured=coloured, arrows=arrows)
         else:
             text = dashboard.line()
-        print(text, file=sys.stderr, flush=True)
-        if ends_s is not None and time.monotonic() >= ends_s:
-            return True
-    return False
+        # A line's end below a full screen would move it up, its title out of sight.
+        print(text, file=sys.stderr, flush=True, end="" if interactive else "\n")
+        over = ends_s is not None and time.monotonic() >= ends_s
+    if interactive:
+        print(file=sys.stderr)
+    return over
