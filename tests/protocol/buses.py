@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 
 from buddyline.protocol.bus import Bus
 from buddyline.protocol.codec import decode
 from buddyline.protocol.messages import Depth, NodeStatus, Rejected
+from buddyline.protocol.zenoh_bus import connect
 
 from tests.protocol.inbox import Inbox
 
 NOW_NS = 1_700_000_000_000_000_000
 
 Connect = Callable[[], Bus]
+
+
+def run_client(endpoint: str, **more: object) -> Bus:
+    bus = connect(endpoint, stop=threading.Event(), on_wait=lambda _: None, **more)  # type: ignore[arg-type]
+    assert bus is not None
+    return bus
+
+
+def numbers(inbox: Inbox, count: int) -> list[int]:
+    """Wait for so many messages; return the numbers in all."""
+    return [int(received.payload) for received in inbox.wait_for(count)]
 
 
 def wait_until_heard(bus: Bus, keys: str, count: int) -> None:

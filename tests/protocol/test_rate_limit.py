@@ -18,8 +18,8 @@ from buddyline.protocol.zenoh_bus.session import config_of
 from buddyline.protocol.zenoh_bus.settings import client_settings
 
 from tests.processes import free_endpoint, until
+from tests.protocol.buses import run_client
 from tests.protocol.inbox import Inbox
-from tests.protocol.test_bus_zenoh import run_client
 
 
 class SecondsClock:
