@@ -13,7 +13,6 @@ from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.estimate import Estimate, alike, lead
 from buddyline.solver_service.track.inputs import AttitudeSeen, FixSeen, TrackNode
 from buddyline.solver_service.track.intake import newest_before
-from buddyline.solver_service.track.lamps import LampWatch
 from buddyline.solver_service.track.lights import BLOCK, Sight
 from buddyline.solver_service.track.output import TrackRow, at_one_time, at_one_time_jacobian, pose_jacobian, rows_of
 from buddyline.solver_service.track.pool import MAX_TENTATIVE, TrackPool
@@ -87,7 +86,6 @@ class TrackFilter(TrackPool):
     ) -> None:
         super().__init__((node_a, node_b), keep_s, clock_sigma_s)
         self.finished: list[Estimate] = []
-        self.lamps = LampWatch()
         self._waiting: list[Estimate] = []
         self._refused = 0
         self._apart_s = -np.inf

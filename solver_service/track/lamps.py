@@ -26,9 +26,16 @@ class LampWatch:
         self._since_s = np.full((2, 2), np.nan)
         self._last_s = np.full((2, 2), np.nan)
         self._missed = np.zeros((2, 2), dtype=int)
+        self._taken_s = np.full(2, -np.inf)
 
     def take(self, node: int, t_s: float, seen: Floats) -> None:
-        """Take a picture of a node's bar whose lamps (2,) should both be in it, and the probability that each is."""
+        """Take a picture of a node's bar whose lamps (2,) should both be in it, and the probability that each is.
+
+        Those of a time that has been taken are left out: a replay shows pictures again.
+        """
+        if t_s <= self._taken_s[node]:
+            return
+        self._taken_s[node] = t_s
         for light in (0, 1):
             if seen[light] > SEEN:
                 self._missed[node, light] = max(min(self._missed[node, light], 2 * DARK_PICTURES) - SIGHTING, 0)

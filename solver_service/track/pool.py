@@ -12,6 +12,7 @@ from buddyline.solver_service.track.association import Association
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.inputs import TrackNode
 from buddyline.solver_service.track.intake import newest_before
+from buddyline.solver_service.track.lamps import LampWatch
 from buddyline.solver_service.track.lights import BLOCK, Sight
 from buddyline.solver_service.track.search import starts
 from buddyline.solver_service.track.shaking import Shaking
@@ -52,6 +53,7 @@ class TrackPool(TrackSteps):
         self.main: Estimate | None = None
         self.challengers: list[Estimate] = []
         self.restarts = self.searches = True
+        self.lamps = LampWatch()
         self._sights: deque[tuple[float, Sight]] = deque()
         self._searched_s, self._searched_of = -np.inf, 1
         self._fix_s = -np.inf
@@ -81,6 +83,8 @@ class TrackPool(TrackSteps):
             for t_s, sight in self._sights:
                 if estimate.start_s <= t_s <= estimate.t_s:
                     self._step(again, t_s, sight)
+                    if path is not None and again.last_seen is not None:
+                        self.lamps.take(1 - sight.node, t_s, again.last_seen)
             path = smoothed(again.steps)
             self.guide_by(path)
         self._keep_s = keep_s
