@@ -66,7 +66,7 @@ MEMORY_S: Final = 30.0
 
 
 @dataclass(frozen=True, eq=False)
-class Present:
+class StateNow:
     """A track at one time: its state, covariance (SIZE, SIZE) and turn rates (2, 3)."""
 
     t_s: float
@@ -89,7 +89,7 @@ class TrackFilter(TrackPool):
         self._waiting: list[Estimate] = []
         self._refused = 0
         self._apart_s = -np.inf
-        self._last_row: tuple[Estimate, Present] | None = None
+        self._last_row: tuple[Estimate, StateNow] | None = None
 
     def advance(self, to_ns: int, outputs_ns: list[int] | None = None) -> list[TrackRow]:
         """Go on to to_ns, up to which all has been added; return the track at the asked stamps in between.
@@ -117,7 +117,7 @@ class TrackFilter(TrackPool):
         self._forget_before(end_s - MEMORY_S)
         return rows
 
-    def present(self, t_s: float) -> Present | None:
+    def present(self, t_s: float) -> StateNow | None:
         """Return the confirmed track at t_s, up to which all has been added, or at a row so little before.
 
         None where there is no such track, or it ends before.
@@ -130,11 +130,11 @@ class TrackFilter(TrackPool):
             return row[1]
         return self._present(main, t_s)
 
-    def _present(self, estimate: Estimate, t_s: float) -> Present:
+    def _present(self, estimate: Estimate, t_s: float) -> StateNow:
         if t_s <= estimate.t_s:
-            return Present(estimate.t_s, estimate.state, estimate.covariance, estimate.rates_radps)
+            return StateNow(estimate.t_s, estimate.state, estimate.covariance, estimate.rates_radps)
         parts = self.increments(estimate, t_s)
-        return Present(t_s, *self._predict(estimate, t_s, parts=parts), parts.rate_radps)
+        return StateNow(t_s, *self._predict(estimate, t_s, parts=parts), parts.rate_radps)
 
     def doubted(self) -> bool:
         """Whether a live track is not to be told; `problems` says why.

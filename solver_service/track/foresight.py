@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
-from buddyline.solver_service.track.filter import Present, TrackFilter
+from buddyline.solver_service.track.filter import StateNow, TrackFilter
 from buddyline.solver_service.track.lights import BLOCK, in_picture, light_positions, pixel_of
 from buddyline.solver_service.track.stepping import HOLD_S
 
@@ -52,7 +52,7 @@ def foresee(track: TrackFilter, known_ns: int, stamps_ns: Mapping[int, int]) -> 
     return {observer: _foreseen(track, observer, t_s - present.t_s, present) for observer, t_s in near.items()}
 
 
-def _foreseen(track: TrackFilter, observer: int, ahead_s: float, present: Present) -> list[ForeseenLight]:
+def _foreseen(track: TrackFilter, observer: int, ahead_s: float, present: StateNow) -> list[ForeseenLight]:
     P = present.covariance[BLOCK]
     rig, other = track.nodes[observer].rig, track.nodes[1 - observer].rig
     dark = {light for node, light, _ in track.lamps.dark() if node == 1 - observer}
