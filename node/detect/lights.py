@@ -43,6 +43,9 @@ _SHARES: Final = np.linspace(0.0, 1.0, 16, dtype=np.float32)
 _DARK: Final = 0.51
 """Where the first ring is below a level on every ray, the outline has half its radius (rings.find_shapes)."""
 _AT_BORDER_PX: Final = 1.0
+# The rim of a light of less height, in grey levels, is looked for between its lowest outlines alone: a step from one
+# outline to the next is then below two sd of the noise.
+_FAINT: Final = 25.0
 """An outline that ends this near to the border is cut by it."""
 
 
@@ -115,7 +118,7 @@ def measure_lights(image: NDArray[np.uint8], proposals: Proposals, water: float)
         own_circle = np.where(weakest[:, None], shapes.circle_px[1], circle)
         own_edge = np.where(weakest[:, None], shapes.edge_px[1, _CORE : HALF + 1], own_edge)
         own_ground = np.where(weakest, ground[1], own_ground)
-    rim_px, core_px = _rims(own_circle)
+    rim_px, core_px = _rims(own_circle, height[0] if not colour else np.where(weakest, height[1], height[0]))
     unclipped = np.minimum(np.maximum((_UNCLIPPED - peak[0]) / _UNCLIPPED_OVER, 0.0), 1.0)
     scattered = _scattered(circle, unclipped, water)
     if scattered.any():
@@ -180,12 +183,15 @@ def _low(level: Floats, share: float) -> Floats:
     return np.partition(flat, k, axis=2)[:, :, k]
 
 
-def _rims(circle_px: Floats) -> tuple[Floats, Floats]:
+def _rims(circle_px: Floats, height: Floats) -> tuple[Floats, Floats]:
     """Return each light's rim, where its profile is steepest: centres (N, 2), radii (N,), from (S, N, 3).
 
-    The rim is the edge of the lamp's face where the face is visible, and else the edge of the clipped glow.
+    The rim is the edge of the lamp's face where the face is visible, and else the edge of the clipped glow. height:
+    (N,), grey levels; of a faint light only the lowest outlines count, because noise draws the higher ones.
     """
-    k = np.maximum(circle_px[1:, :, 2] - circle_px[:-1, :, 2], 0.15).argmin(axis=0)
+    widening = np.maximum(circle_px[1:, :, 2] - circle_px[:-1, :, 2], 0.15)
+    widening[:-1, height < _FAINT] = np.inf
+    k = widening.argmin(axis=0)
     rim = (0.5 * (circle_px[1:] + circle_px[:-1]))[k, np.arange(len(k))]
     return rim[:, :2], rim[:, 2]
 

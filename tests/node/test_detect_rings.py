@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from buddyline.node.detect.lights import distinct
+from buddyline.node.detect.lights import _rims, distinct
 from buddyline.node.detect.rings import elongation, find_shapes, geometric_radii, luminance, sample_rings
 
 SHARES = np.linspace(0.0, 1.0, 120, dtype=np.float32)
@@ -44,3 +44,13 @@ def test_a_place_that_overlaps_an_earlier_one_is_left_out():
     radius_px = np.array([10.0, 1.0, 1.0, 50.0, 1.0])
     assert distinct(centre_px, radius_px, 9) == [0, 2, 4]
     assert distinct(centre_px, radius_px, 2) == [0, 2]
+
+
+def test_the_rim_of_a_faint_light_is_not_the_outline_of_its_noise():
+    """A lamp's face of 3.6 px in turbid water, a bright speckle beside its middle, and it 7 times brighter."""
+    circle_px = np.array([[[1.6, 0.0, 0.7]], [[1.3, 0.0, 1.4]], [[0.1, 0.0, 3.0]], [[0.1, 0.0, 4.0]]])
+    (faint_px,), (faint_radius_px,) = _rims(circle_px, np.array([14.0]))
+    assert np.hypot(*faint_px) < 0.2
+    assert 3.0 < faint_radius_px < 4.0
+    _, (bright_radius_px,) = _rims(circle_px, np.array([98.0]))
+    assert bright_radius_px < 1.5
