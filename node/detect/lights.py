@@ -43,10 +43,10 @@ _SHARES: Final = np.linspace(0.0, 1.0, 16, dtype=np.float32)
 _DARK: Final = 0.51
 """Where the first ring is below a level on every ray, the outline has half its radius (rings.find_shapes)."""
 _AT_BORDER_PX: Final = 1.0
-# The rim of a light of less height, in grey levels, is looked for between its lowest outlines alone: a step from one
-# outline to the next is then below two sd of the noise.
-_FAINT: Final = 25.0
 """An outline that ends this near to the border is cut by it."""
+_FAINT: Final = 25.0
+"""The rim of a light of less height, in grey levels, is looked for between its lowest outlines alone: a step from one
+outline to the next is then about two sd of the noise."""
 
 
 class Lights(NamedTuple):
