@@ -26,9 +26,9 @@ def access_rules(nodes: Iterable[str], namespace: str = "", shut_out: Iterable[s
     """Return Zenoh's `access_control`: a node publishes its own keys, the solver its results; all clients read all.
 
     A surveyor publishes marks for any node. A player publishes the keys of all nodes of a stored dive. A bridge to ROS
-    publishes ROS's keys. Everything else is denied. Zenoh keeps its caches under `@adv`, which `*` and `**` do not
-    match; each rule therefore also names them, because history would otherwise be lost silently. shut_out: names of
-    certificates that may neither publish nor read.
+    publishes ROS's keys. Everything else is denied. Heartbeats, and what publishers hold, are under `@adv`, which `*`
+    and `**` do not match; each rule therefore also names them, because history would otherwise be lost silently.
+    shut_out: names of certificates that may neither publish nor read.
     """
     root = f"{namespace}/buddyline" if namespace else "buddyline"
     everything = [f"{root}/**", f"{root}/**/@adv/**", f"{root}/@alive/**", *_ROS_KEYS]

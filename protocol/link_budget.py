@@ -32,6 +32,8 @@ _RESERVES: Final = (-1.0, 0.9, 0.6, 0.3, 0.1)
 WORDS_S: Final = 10.0
 # What can wait for hours goes only where so much of a second's budget is left.
 SPARE_SHARE: Final = 0.8
+# What was missed has this share of the budget for itself: candidates and their copies may always use up the rest.
+ANSWER_SHARE: Final = 0.25
 
 
 class LinkBudget:
@@ -46,6 +48,7 @@ class LinkBudget:
         self._lock = threading.Lock()
         self._limit: float | None = None
         self._tokens = 0.0
+        self._answer_tokens = 0.0
         self._tokens_s = 0.0
         self._offered = 0.0
         self._kept_s: dict[str, float] = {}
@@ -82,9 +85,23 @@ class LinkBudget:
         A copy only counts as the next message: behind a full connection it would take that one's room for nothing.
         """
         with self._lock:
-            if self._limit is None or now_s - self._clear_s > BEHIND_S:
+            if self._limit is None or self._is_behind(now_s):
                 return False
             self._refill(now_s, self._limit)
+            self._spend(float(size_bytes + OVERHEAD_BYTES))
+            return True
+
+    def admits_answer(self, size_bytes: int, now_s: float) -> bool:
+        """Return whether the link has room for a part of what was missed; if so, count it as sent.
+
+        Behind a full connection there is none. Otherwise a part goes while the answers' share is not overdrawn.
+        """
+        with self._lock:
+            if self._limit is not None:
+                self._refill(now_s, self._limit)
+                if self._answer_tokens < 0.0 or self._is_behind(now_s):
+                    return False
+                self._answer_tokens -= size_bytes + OVERHEAD_BYTES
             self._spend(float(size_bytes + OVERHEAD_BYTES))
             return True
 
@@ -139,8 +156,13 @@ class LinkBudget:
             return self._words
 
     def _refill(self, now_s: float, limit: float) -> None:
-        self._tokens = min(self._tokens + (now_s - self._tokens_s) * limit, limit)
+        earned = (now_s - self._tokens_s) * limit
+        self._tokens = min(self._tokens + earned, limit)
+        self._answer_tokens = min(self._answer_tokens + ANSWER_SHARE * earned, limit)
         self._tokens_s = now_s
+
+    def _is_behind(self, now_s: float) -> bool:
+        return now_s - self._clear_s > BEHIND_S
 
     def _spend(self, cost: float) -> None:
         """Count bytes as sent. At most a second's budget is owed."""
@@ -169,6 +191,6 @@ class LinkBudget:
         if self._limit is not None:
             limit = min(limit, self._limit)
         else:
-            self._tokens, self._tokens_s = 0.0, now_s
+            self._tokens, self._answer_tokens, self._tokens_s = 0.0, 0.0, now_s
         self._limit = max(limit, LEAST_BYTES_PER_S)
         self._reduced_s = now_s

@@ -25,12 +25,14 @@ from buddyline.protocol.bus import (
 from buddyline.protocol.clock import Clock, SystemClock
 from buddyline.protocol.delivery import Delivery, RateCap
 from buddyline.protocol.endpoint import DEFAULT_ENDPOINT
+from buddyline.protocol.held import Held, HeldMessage
 from buddyline.protocol.link_budget import LinkBudget
 from buddyline.protocol.rate_limit import RateLimit
 from buddyline.protocol.security import PLAYER, Tls
 from buddyline.protocol.topics import Topic
 from buddyline.protocol.zenoh_bus.alive import ALIVE, ZenohWatch
 from buddyline.protocol.zenoh_bus.answers import AnswerDesk, ask
+from buddyline.protocol.zenoh_bus.held_desk import HeldDesk
 from buddyline.protocol.zenoh_bus.link import Bulk, Link
 from buddyline.protocol.zenoh_bus.session import SecondLink, config_of, open_client
 from buddyline.protocol.zenoh_bus.settings import client_settings
@@ -73,6 +75,7 @@ class ZenohPublisher(Publisher):
 
     budget: decides what a slow link carries. hurry: is called after each message of a prompt topic, with what its copy
     says of its source.
+    desk: answers those that missed a message, from the last `depth` of them (0: images, of which none is held).
     answer_in: the session in which a plain `get` is answered with the last message; None: it is not answered here.
     """
 
@@ -84,11 +87,15 @@ class ZenohPublisher(Publisher):
         cap: RateCap,
         budget: LinkBudget,
         hurry: Callable[[bytes, zenoh.SourceInfo], None],
+        desk: HeldDesk,
+        depth: int,
         answer_in: zenoh.Session | None = None,
     ) -> None:
         super().__init__(topic, key, cap)
         self._budget = budget
         self._hurry = hurry
+        self._desk = desk
+        self._held = Held(depth) if depth else None
         self._count = 0
         self._declare = declare
         self._last: bytes | None = None
@@ -96,6 +103,11 @@ class ZenohPublisher(Publisher):
         # A publisher cannot be undeclared while another thread, such as a device's, is in its put.
         self._lock = threading.Lock()
         self._publisher = declare()
+        self._held_key = ""
+        if self._held is not None and self._publisher is not None:
+            identity = self._publisher.id
+            self._held_key = f"{key}/@adv/pub/{identity.zid}/{identity.eid}/_"
+            desk.show(self._held_key, self._held, topic.encoding)
 
     def _send(self, payload: bytes, *, again: bool = False) -> bool:
         if not self._budget.admits(self.topic, len(payload), time.monotonic()):
@@ -106,11 +118,13 @@ class ZenohPublisher(Publisher):
             self._publisher = self._publisher or self._declare()
             if self._publisher is None:
                 return False
+            if self._held is not None:
+                self._held.add(HeldMessage(self._count, payload, again))
             self._publisher.put(payload, attachment=AGAIN if again else None)
             self._last = payload
             if self.topic.prompt:
                 self._hurry(payload, zenoh.SourceInfo(self._publisher.id, self._count))
-                self._count += 1
+            self._count += 1
         return True
 
     def _answer(self, query: zenoh.Query) -> None:
@@ -124,6 +138,7 @@ class ZenohPublisher(Publisher):
         with self._lock:
             if not self._closed:
                 self._closed = True
+                self._desk.take_away(self._held_key)
                 for declared in (self._publisher, self._answers):
                     if declared is not None:
                         declared.undeclare()  # type: ignore[no-untyped-call]
@@ -149,6 +164,7 @@ class ZenohBus(Bus):
         self._asking = zenoh.CancellationToken()
         self._budget = LinkBudget()
         self._link = Link(session, self._budget, Bulk(self._bulk))
+        self._held = HeldDesk(session, lambda: self._budget if self._link.is_long else None, self._failures)
         self._watchdog = Watchdog(session, self._link)
         # A thread inside Zenoh at the interpreter's end aborts the process, so the bus closes before that.
         atexit.register(self.close)
@@ -172,7 +188,6 @@ class ZenohBus(Bus):
             return zenoh.ext.declare_advanced_publisher(
                 self._session,
                 key,
-                cache=zenoh.ext.CacheConfig(depth),
                 sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
                 **settings,
             )
@@ -194,7 +209,7 @@ class ZenohBus(Bus):
         # What the hub retains is answered by the hub.
         answer_in = self._session if topic.latest_only and not topic.retained else None
         cap = RateCap(max_rate_hz, self.clock)
-        wrapped = ZenohPublisher(declare, topic, key, cap, self._budget, hurry, answer_in)
+        wrapped = ZenohPublisher(declare, topic, key, cap, self._budget, hurry, self._held, depth, answer_in)
         with self._lock:
             self._publishers.append(wrapped)
         return wrapped
@@ -298,6 +313,7 @@ class ZenohBus(Bus):
         atexit.unregister(self.close)
         for answers in self._answers:
             answers.close()
+        self._held.close()
         self._link.stop()
         self._watchdog.stop()
         self._session.close()  # type: ignore[no-untyped-call]

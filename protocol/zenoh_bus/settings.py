@@ -7,6 +7,7 @@ from typing import Final
 from buddyline.protocol.codec import MAX_MESSAGE_BYTES
 from buddyline.protocol.endpoint import host_and_port
 from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.held import OVERHEAD_BYTES, PAGE_BYTES
 from buddyline.protocol.log_pages import MOST_PAGE_BYTES
 from buddyline.protocol.security import Tls
 from buddyline.protocol.topics import LOG, TOPICS
@@ -43,19 +44,21 @@ def hub_settings(endpoint: str, tls: Tls | None = None, access: dict[str, object
 def size_limits() -> list[dict[str, object]]:
     """Return Zenoh's `low_pass_filter` for a hub: payloads above their topic's limit go no further.
 
-    Each client's caches and heartbeats are under `@adv`, which `**` does not match.
+    Each client's heartbeats and pages of what it holds are under `@adv`, which `**` does not match.
     """
     keys: dict[int, list[str]] = {}
     for topic in TOPICS:
         # Clients may have a namespace, which comes before the key; the hub itself has none.
-        keys.setdefault(topic.max_bytes, []).append(f"**/{topic.key_any()}")
+        key = f"**/{topic.key_any()}"
+        keys.setdefault(topic.max_bytes, []).append(key)
+        keys.setdefault(max(topic.max_bytes, PAGE_BYTES) + OVERHEAD_BYTES, []).append(f"{key}/@adv/**")
     keys.setdefault(MOST_PAGE_BYTES, []).append(f"**/{LOG.format(node='*')}")
     return [
         {
             "id": f"at most {max_bytes} bytes",
             "flows": ["ingress"],
             "messages": ["put", "delete", "query", "reply"],
-            "key_exprs": [*of_size, *(f"{key}/@adv/**" for key in of_size)],
+            "key_exprs": of_size,
             "size_limit": max_bytes,
         }
         for max_bytes, of_size in keys.items()

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from typing import Final
+from collections.abc import Callable, Sequence
+from typing import Final, NamedTuple
 
 import zenoh
 from buddyline.protocol.bus import Received, held_order, queue_of
 from buddyline.protocol.clock import Clock
 from buddyline.protocol.delivery import CLOSE_S, Delivery, FailureLatch, Repeats
+from buddyline.protocol.held import open_page
 from buddyline.protocol.rate_limit import RateLimit
 from buddyline.protocol.sequence import Gap, PublisherId, SampleSequence
 from buddyline.protocol.topics import parse_key
@@ -28,6 +30,19 @@ MAX_OWNER_GAPS: Final = 8
 MAX_GAPS: Final = 64
 # Queries for one gap.
 FETCHES: Final = 16
+# Pages of an answer that may wait: more than all that a publisher holds.
+PAGES: Final = 8192
+_ADV: Final = "/@adv/pub/"
+
+
+class Arrived(NamedTuple):
+    """A message as it has come, or as its publisher held it. number: None if its publisher does not count."""
+
+    source: PublisherId
+    number: int | None
+    payload: bytes
+    attachment: bytes
+    encoding: str
 
 
 class ZenohSubscription:
@@ -57,7 +72,7 @@ class ZenohSubscription:
         self._failures = failures
         self._lock = threading.Lock()
         self._joined = False
-        self._sequence = SampleSequence(self._deliver)
+        self._sequence = SampleSequence[Arrived](self._deliver)
         self._repeats = Repeats(history=history)
         self._fetching: dict[threading.Thread, str] = {}
         self._stop = threading.Event()
@@ -66,11 +81,14 @@ class ZenohSubscription:
         if history:
             beside = [f"{key_expr}/@adv/pub/**" for key_expr in key_exprs]
             subscribers += [(selector, self._take_heartbeat, self._declare(selector)) for selector in beside]
-            held = [sample for selector in beside for sample in self._query(selector)]
-            for sample in sorted(held, key=_number):
-                self._sequence.begin(_source(sample), _number(sample))
-            for sample in sorted(held, key=_held_order):
-                self._accept(sample)
+            held: list[Arrived] = []
+            for selector in beside:
+                oldest, found = self._query(selector)
+                held += found
+                for source, number in oldest.items():
+                    self._sequence.begin(source, number)
+            for arrived in sorted(held, key=_held_order):
+                self._accept(arrived)
         wanted = [(key_expr, accept) for key_expr, accept, _ in subscribers]
         self._narrowing = Narrowing(wanted, self._intake, limit, self._present, failures)
         # What was held goes first, in its own order.
@@ -123,12 +141,14 @@ class ZenohSubscription:
     def _take(self, sample: zenoh.Sample) -> bool:
         """Accept a sample that has come just now; return False if there are too many of its key."""
         if self._limit.admits(str(sample.key_expr), len(sample.payload)):
-            self._accept(sample)
+            if sample.kind == zenoh.SampleKind.PUT:
+                self._accept(_arrived(sample))
             return True
         self._narrowing.watch()
-        if sample.source_info is not None:
+        info = sample.source_info
+        if info is not None:
             with self._lock:
-                self._sequence.skip(_source(sample), _number(sample))
+                self._sequence.skip(_source(str(sample.key_expr), info), info.source_sn)
         return False
 
     def _take_heartbeat(self, sample: zenoh.Sample) -> bool:
@@ -138,23 +158,21 @@ class ZenohSubscription:
         self._narrowing.watch()
         return False
 
-    def _accept(self, sample: zenoh.Sample) -> None:
-        """Deliver a sample, or hold it until the publisher's missing earlier samples are fetched."""
-        if sample.kind != zenoh.SampleKind.PUT:
+    def _accept(self, arrived: Arrived) -> None:
+        """Deliver a message, or hold it until the publisher's missing earlier messages are fetched."""
+        if arrived.number is None:
+            self._deliver(arrived)
             return
-        if sample.source_info is None:
-            self._deliver(sample)
-            return
-        source = _source(sample)
+        source = arrived.source
         with self._lock:
-            if _attachment(sample) == COPY:
-                self._sequence.accept_copy(source, _number(sample), sample)
+            if arrived.attachment == COPY:
+                self._sequence.accept_copy(source, arrived.number, arrived)
                 return
             gap = self._sequence.accept(
                 source,
-                _number(sample),
-                sample,
-                size_bytes=len(sample.payload),
+                arrived.number,
+                arrived,
+                size_bytes=len(arrived.payload),
                 recover=self._history,
                 newest_only=_newest_only(source.key),
             )
@@ -162,14 +180,12 @@ class ZenohSubscription:
 
     def _accept_heartbeat(self, sample: zenoh.Sample) -> None:
         """Take a publisher's heartbeat: on its key with `/@adv/pub/ZID/EID/_`, its last number as four bytes."""
-        key, _, rest = str(sample.key_expr).partition("/@adv/pub/")
-        chunks, payload = rest.split("/"), sample.payload.to_bytes()
-        if sample.kind != zenoh.SampleKind.PUT or len(payload) != 4 or len(chunks) < 2 or not chunks[1].isdecimal():
+        source, payload = _publisher_at(str(sample.key_expr)), sample.payload.to_bytes()
+        if sample.kind != zenoh.SampleKind.PUT or len(payload) != 4 or source is None:
             return
-        source = PublisherId(key, chunks[0], int(chunks[1]))
         with self._lock:
             last = int.from_bytes(payload, "little")
-            self._start_filling(self._sequence.heartbeat(source, last, newest_only=_newest_only(key)))
+            self._start_filling(self._sequence.heartbeat(source, last, newest_only=_newest_only(source.key)))
 
     def _start_filling(self, gap: Gap | None) -> None:
         """Fetch a gap in a thread of its own; the lock is held."""
@@ -198,55 +214,75 @@ class ZenohSubscription:
             with self._lock:
                 self._fetching.pop(threading.current_thread(), None)
 
-    def _fetch(self, gap: Gap) -> list[tuple[int, zenoh.Sample]]:
-        """Return the samples of a gap that its publisher still holds; ask again for some time if it does not answer."""
-        # The gap's last sample, or the one after it, has been heard of: an answer that contains one is complete.
-        last = gap.missing[-1]
+    def _fetch(self, gap: Gap) -> list[tuple[int, Arrived]]:
+        """Return the messages of a gap that its publisher still holds; ask again for some time for what is missing."""
         source = gap.source
-        selector = f"{source.key}/@adv/pub/{source.zid}/{source.eid}/**?_sn={gap.missing[0]}..{last + 1}"
-        found: dict[int, zenoh.Sample] = {}
+        missing, found = set(gap.missing), dict[int, Arrived]()
         for _ in range(FETCHES):
-            # An answer may come from anybody who may answer on this key, and say any source.
-            found.update((_number(sample), sample) for sample in self._query(selector) if _source(sample) == source)
-            if last in found or last + 1 in found or self._stop.wait(RETRY_S):
+            selector = f"{source.key}{_ADV}{source.zid}/{source.eid}/**?_sn={min(missing)}..{max(missing)}"
+            oldest, answer = self._query(selector)
+            # An answer on another's key says nothing of this publisher.
+            found.update((one.number, one) for one in answer if one.source == source and one.number is not None)
+            missing = {number for number in missing if number not in found and number >= oldest.get(source, 0)}
+            if not missing or self._stop.wait(RETRY_S):
                 break
         return list(found.items())
 
-    def _query(self, selector: str) -> Iterator[zenoh.Sample]:
+    def _query(self, selector: str) -> tuple[dict[PublisherId, int], list[Arrived]]:
+        """Return the numbers of the oldest messages that there are, by publisher, and the messages that they answer."""
+        oldest: dict[PublisherId, int] = {}
+        found: list[Arrived] = []
         for reply in self._session.get(
             selector,
+            zenoh.handlers.FifoChannel(PAGES),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
-            accept_replies=zenoh.ReplyKeyExpr.ANY,
             timeout=QUERY_S,
             cancellation_token=self._asking,
         ):
-            if reply.ok is not None and reply.ok.source_info is not None:
-                yield reply.ok
+            source = None if reply.ok is None else _publisher_at(str(reply.ok.key_expr))
+            if reply.ok is None or source is None:
+                continue
+            with contextlib.suppress(ValueError):
+                told, messages = open_page(reply.ok.payload.to_bytes())
+                oldest[source] = max(told, oldest.get(source, 0))
+                encoding = str(reply.ok.encoding)
+                found += [
+                    Arrived(source, one.number, one.payload, AGAIN if one.again else b"", encoding) for one in messages
+                ]
+        return oldest, found
 
-    def _deliver(self, sample: zenoh.Sample) -> None:
-        key, payload = str(sample.key_expr), bytes(sample.payload)
-        parsed, again = parse_key(key), _attachment(sample) == AGAIN
+    def _deliver(self, arrived: Arrived) -> None:
+        key, payload = arrived.source.key, arrived.payload
+        parsed, again = parse_key(key), arrived.attachment == AGAIN
         repeated = parsed is not None and parsed[0].repeated
-        if repeated and not self._repeats.is_wanted(key, payload, _source(sample), again=again):
+        if repeated and not self._repeats.is_wanted(key, payload, arrived.source, again=again):
             return
-        received = Received(
-            key=key,
-            payload=payload,
-            receive_ns=self._clock.now_ns(),
-            encoding=str(sample.encoding),
-        )
+        received = Received(key=key, payload=payload, receive_ns=self._clock.now_ns(), encoding=arrived.encoding)
         queue = queue_of(received.key, received.payload, received.receive_ns) if self._joined else ""
         self._delivery.offer(received, len(received.payload), queue)
 
 
-def _source(sample: zenoh.Sample) -> PublisherId:
+def _arrived(sample: zenoh.Sample) -> Arrived:
     key, info = str(sample.key_expr), sample.source_info
-    return PublisherId(key, "", 0) if info is None else PublisherId(key, str(info.source_id.zid), info.source_id.eid)
+    return Arrived(
+        PublisherId(key, "", 0) if info is None else _source(key, info),
+        None if info is None else info.source_sn,
+        sample.payload.to_bytes(),
+        b"" if sample.attachment is None else sample.attachment.to_bytes(),
+        str(sample.encoding),
+    )
 
 
-def _attachment(sample: zenoh.Sample) -> bytes:
-    return b"" if sample.attachment is None else sample.attachment.to_bytes()
+def _source(key: str, info: zenoh.SourceInfo) -> PublisherId:
+    return PublisherId(key, str(info.source_id.zid), info.source_id.eid)
+
+
+def _publisher_at(key: str) -> PublisherId | None:
+    """Return the publisher whose heartbeats and answers have this key; None if it is not such a key."""
+    of, _, rest = key.partition(_ADV)
+    chunks = rest.split("/")
+    return PublisherId(of, chunks[0], int(chunks[1])) if len(chunks) > 1 and chunks[1].isdecimal() else None
 
 
 def _newest_only(key: str) -> bool:
@@ -255,10 +291,5 @@ def _newest_only(key: str) -> bool:
     return parsed is None or parsed[0].latest_only
 
 
-def _number(sample: zenoh.Sample) -> int:
-    info = sample.source_info
-    return -1 if info is None else info.source_sn
-
-
-def _held_order(sample: zenoh.Sample) -> tuple[bool, int, int]:
-    return (*held_order(str(sample.key_expr), bytes(sample.payload)), _number(sample))
+def _held_order(arrived: Arrived) -> tuple[bool, int, int]:
+    return (*held_order(arrived.source.key, arrived.payload), arrived.number or 0)

@@ -85,9 +85,43 @@ def gaps(session: zenoh.Session) -> Iterator[None]:
 def queries(session: zenoh.Session) -> Iterator[None]:
     """Ask for everything that is held, and do not wait for the answers."""
     while True:
-        session.get("buddyline/**/@adv/**", lambda reply: None, accept_replies=zenoh.ReplyKeyExpr.ANY)
+        session.get(
+            "buddyline/**/@adv/**",
+            lambda reply: None,
+            target=zenoh.QueryTarget.ALL,
+            accept_replies=zenoh.ReplyKeyExpr.ANY,
+            priority=zenoh.Priority.REAL_TIME,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
         yield
         time.sleep(0.001)
+
+
+def lasts(session: zenoh.Session) -> Iterator[None]:
+    """Ask for the last message of everything, and do not wait for the answers."""
+    while True:
+        session.get("buddyline/**", lambda reply: None, target=zenoh.QueryTarget.ALL)
+        yield
+        time.sleep(0.001)
+
+
+def logs(session: zenoh.Session) -> Iterator[None]:
+    """Ask for what nodes have in their logs."""
+    for k in count():
+        text = f"since=0;until={time.time_ns() - k};topics=candidates+imu"
+        session.get(f"buddyline/node/*/log?{text}", lambda reply: None, target=zenoh.QueryTarget.ALL)
+        yield
+        time.sleep(0.001)
+
+
+def subscribers(session: zenoh.Session) -> Iterator[None]:
+    """Subscribe to everything, again and again, and take nothing."""
+    for k in count():
+        ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(1)
+        subscriber = session.declare_subscriber("buddyline/**" if k % 3 else f"buddyline/node/c/{k}", ring)
+        yield
+        if k % 2:
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
 
 
 def tokens(session: zenoh.Session) -> Iterator[None]:
@@ -107,7 +141,8 @@ def none(_session: zenoh.Session) -> Iterator[None]:
 
 
 ATTACKS: dict[str, Callable[[zenoh.Session], Iterator[None]]] = {
-    one.__name__: one for one in (small, large, images, samples, frames, gaps, queries, tokens)
+    one.__name__: one
+    for one in (small, large, images, samples, frames, gaps, queries, lasts, logs, subscribers, tokens)
 }
 
 

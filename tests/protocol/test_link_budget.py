@@ -7,7 +7,7 @@ from collections import Counter
 import pytest
 from buddyline.protocol import topics
 from buddyline.protocol.connection import TcpState
-from buddyline.protocol.link_budget import OVERHEAD_BYTES, LinkBudget
+from buddyline.protocol.link_budget import ANSWER_SHARE, OVERHEAD_BYTES, LinkBudget
 
 STEP_S = 0.01
 SENT = (  # topic, rate (Hz), payload (bytes)
@@ -91,3 +91,63 @@ def test_copies_go_on_a_slow_link_that_is_not_behind() -> None:
         budget.observe(TcpState(0, 4096, 0, 0, 0.4), 27.0 + step / 10)
     assert not budget.admits_copy(1000, 29.0)
     assert "messages wait for more than 1 s, for 2 s now" in budget.words(29.0)
+
+
+def clear(budget: LinkBudget, seconds: float, start_s: float, waiting: int = 0) -> float:
+    """Let the connection be seen with so many bytes waiting for some time; return its end."""
+    for step in range(round(10 * seconds) + 1):
+        budget.observe(TcpState(0, waiting, 0, 0, 0.4), start_s + step / 10)
+    return start_s + seconds
+
+
+def test_without_a_limit_all_that_was_missed_is_sent() -> None:
+    budget = LinkBudget()
+    assert all(budget.admits_answer(10**6, 0.0) for _ in range(100))
+
+
+def test_answers_of_a_flood_of_questions_get_their_share_of_a_slow_link() -> None:
+    budget = LinkBudget()
+    run(20_000.0, 30.0, budget)
+    sent, now_s = 0, clear(budget, 1.0, 30.0)
+    limit = budget.bytes_per_s
+    assert limit is not None
+    for step in range(1000):
+        for _ in range(10):
+            sent += 1100 if budget.admits_answer(1000, now_s + step / 100) else 0
+        budget.observe(TcpState(0, 0, 0, 0, 0.4), now_s + step / 100)
+    # A second's budget at once, and the share for ten seconds; the limit rises by 3 % a second meanwhile.
+    assert 10 * ANSWER_SHARE * limit < sent < 1.35 * (1 + 10 * ANSWER_SHARE) * limit + 1100
+
+
+def test_candidates_and_copies_that_use_up_a_slow_link_leave_the_answers_their_share() -> None:
+    budget = LinkBudget()
+    run(12_000.0, 30.0, budget)
+    sent, now_s = 0, clear(budget, 1.0, 30.0)
+    for step in range(100):
+        at_s = now_s + step / 10
+        budget.observe(TcpState(0, 0, 0, 0, 0.4), at_s)
+        assert budget.admits(topics.CANDIDATES, 4000, at_s)
+        assert budget.admits_copy(8000, at_s)
+        sent += budget.admits_answer(1000, at_s)
+    assert budget.bytes_per_s is not None
+    assert sent > 10 * ANSWER_SHARE * 0.8 * budget.bytes_per_s / 1100
+
+
+def test_what_was_missed_waits_while_the_connection_is_behind() -> None:
+    budget = LinkBudget()
+    run(12_000.0, 30.0, budget)
+    now_s = clear(budget, 1.0, 30.0)
+    assert budget.admits_answer(1000, now_s)
+    now_s = clear(budget, 2.0, now_s, waiting=4096)
+    assert not budget.admits_answer(1000, now_s)
+    now_s = clear(budget, 1.0, now_s)
+    assert budget.admits_answer(1000, now_s)
+
+
+def test_answers_leave_no_room_for_what_may_be_left_out() -> None:
+    budget = LinkBudget()
+    run(12_000.0, 30.0, budget)
+    now_s = clear(budget, 2.0, 30.0)
+    assert budget.admits_spare(100, now_s)
+    assert budget.admits_answer(8000, now_s)
+    assert not budget.admits_spare(100, now_s)
