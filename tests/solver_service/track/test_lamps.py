@@ -57,8 +57,8 @@ def test_a_dead_lamp_is_named_within_ten_seconds(seed, lamp):
 
 
 def test_a_dead_lamp_is_named_within_ten_seconds_by_a_track_that_starts_late():
-    """The track starts at 4.9 s; the pictures of its replay say it."""
-    assert "left lamp of a has not been seen for" in status_problem(1718, 10.0, "a.left", inertial="poor")
+    """The track starts after 4 s; the pictures of its replay say it."""
+    assert "right lamp of a has not been seen for" in status_problem(1719, 10.0, "a.right", inertial="poor")
 
 
 def test_a_dead_lamp_is_named_offline():
