@@ -40,6 +40,10 @@ FIXES_TO_REPLACE: Final = 3
 # So many fixes on end that contradict a track, and so many of those that agreed, are enough for it not to be told live.
 FIXES_TO_DOUBT: Final = 2
 SHARE_TO_DOUBT: Final = 0.2
+# A start without a fix is not told either while it has followed single lights for so long, if it has seen few
+# pictures with both, and no fix: its range then drifts, with too small a covariance.
+LONE_S: Final = 1.0
+BARS_TO_FOLLOW: Final = 25
 # A rival that began so much later than the best is younger.
 LATE_S: Final = 0.1
 # A confirmed track ends when no light was used for so long, and its position's sigma exceeds this share of the range,
@@ -140,7 +144,8 @@ class TrackFilter(TrackPool):
         """Whether a live track is not to be told; `problems` says why.
 
         Its clocks prove further apart than it bears, or did lately, or the last fixes contradict it: its first updates
-        were then far from linear. A track that starts anew believes in its clocks anew.
+        were then far from linear. Or it follows single lights before it is well founded. A track that starts anew
+        believes in its clocks anew.
         """
         main = self.main
         if main is None:
@@ -156,7 +161,16 @@ class TrackFilter(TrackPool):
             self._problems.report(f"{self.both}: their clocks are far apart: no live track", main.t_s)
         if contradicted:
             self._problems.report(f"{self.both}: poses contradict the live track", main.t_s)
-        return apart or contradicted
+        lone = self._lone(main)
+        if lone:
+            self._problems.report(f"{self.both}: single lights alone, too early: no live track", main.t_s)
+        return apart or contradicted or lone
+
+    @staticmethod
+    def _lone(main: Estimate) -> bool:
+        """Whether a start without a fix follows single lights before enough pictures with both have founded it."""
+        founded = not main.searched or main.agreed > 0 or main.bars >= BARS_TO_FOLLOW
+        return not founded and main.light_s - main.bar_s > LONE_S
 
     def _take_sight(self, t_s: float, sight: Sight) -> None:
         self._check_units(t_s)

@@ -376,7 +376,9 @@ class TrackSteps(TrackIntake):
                 estimate.used[observer, sight.stamp_ns] = found.chosen
             if estimate.unseen_by == observer:
                 estimate.unseen_by = None
-            estimate.bars += len(found.chosen) == 2
+            if len(found.chosen) == 2:
+                estimate.bars += 1
+                estimate.bar_s = sight.t_s
             estimate.told_by[observer] += 1
         return Look(observer, sight.stamp_ns, sight.t_s, found.chosen)
 
