@@ -40,8 +40,8 @@ FIXES_TO_REPLACE: Final = 3
 # So many fixes on end that contradict a track, and so many of those that agreed, are enough for it not to be told live.
 FIXES_TO_DOUBT: Final = 2
 SHARE_TO_DOUBT: Final = 0.2
-# A start without a fix is not told either while it has followed single lights for so long, if it has seen few
-# pictures with both, and no fix: its range then drifts, with too small a covariance.
+# A start without a fix can drift in range, with too small a covariance, while it follows single lights. Live, it is not
+# told after LONE_S of them, until BARS_TO_FOLLOW pictures have shown both lights or a fix has agreed.
 LONE_S: Final = 1.0
 BARS_TO_FOLLOW: Final = 25
 # A rival that began so much later than the best is younger.
@@ -63,7 +63,7 @@ APART_S: Final = 20.0
 FAR_SIGMAS: Final = 6.0
 # Longest step, without a picture, over which a track tells its present state.
 BRIDGED_S: Final = 1.0
-# The present is told by a row that is no more than this before it.
+# The last row stands for the present where it is at most this much before it.
 LITTLE_S: Final = 0.01
 # Messages older than this are dropped. The noise of slow sensors is learned from so much.
 MEMORY_S: Final = 30.0
@@ -122,9 +122,9 @@ class TrackFilter(TrackPool):
         return rows
 
     def present(self, t_s: float) -> StateNow | None:
-        """Return the confirmed track at t_s, up to which all has been added, or at a row so little before.
+        """Return the confirmed track at t_s, or its last row where that is at most LITTLE_S before.
 
-        None where there is no such track, or it ends before.
+        All events up to t_s must have been added. None where there is no such track, or it ends before.
         """
         main = self.main
         if main is None or not main.confirmed or self.doubted() or not 0.0 <= t_s - main.t_s < BRIDGED_S:

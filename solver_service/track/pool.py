@@ -71,9 +71,9 @@ class TrackPool(TrackSteps):
     def _replayed(self, estimate: Estimate) -> Estimate:
         """Give an estimate anew from its start, with its lights decided again by all pictures since.
 
-        A start's first updates are far from linear: its covariance is too small for what they left, so that it misses
-        lights that do not fit. The first pass starts from the state that it has come to, taken back; the next from what
-        the pass before, smoothed, gives for the start.
+        A start's first updates are far from linear. They leave too small a covariance, and then lights that do not fit
+        are missed. The first pass begins with the present state, taken back to the start. The next pass begins with the
+        smoothed state of the first.
         """
         again, path = estimate, None
         keep_s, self._keep_s = self._keep_s, math.inf
