@@ -258,7 +258,7 @@ def experiments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="a new folder for the report")
     parser.add_argument("--quick", action="store_true", help="short dives: a first look, not figures to quote")
     parser.add_argument(
-        "--readme", type=Path, metavar="README.md", help="write the summary table into this file, between its markers"
+        "--readme", type=Path, metavar="README.md", help="write the main figures into this file, between its markers"
     )
     parser.add_argument(
         "--tag-video", type=Path, metavar="FILE", help="test_vid.mp4 of github.com/mark-belbin/underwater-apriltags"

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.cli import main
+from buddyline.tools.experiments.numbers import README_ROWS
 from buddyline.tools.experiments.readme import (
     COMMAND,
     deciding_hash,
@@ -32,6 +33,12 @@ def test_the_readme_table_was_measured_with_this_code():
     assert written_hash(README.read_text()) == deciding_hash(), (
         f"the table in README.md is older than what decides poses (detector or solver); write it anew: {COMMAND}"
     )
+
+
+def test_the_readme_has_the_main_rows_of_the_headline():
+    table = README.read_text().partition("accuracy of code")[2].partition("end of accuracy")[0]
+    rows = [line for line in table.splitlines() if line.startswith("| ")][2:]
+    assert [row.startswith(f"| {name}") for row, name in zip(rows, README_ROWS, strict=True)] == [True] * len(rows)
 
 
 @pytest.mark.parametrize(

@@ -88,7 +88,8 @@ def run(args: argparse.Namespace) -> int:
     (args.output / "report.html").write_text(report(found, rows, args.output), encoding="utf-8")
     if args.readme is not None:
         # The file is read again, because it may have been edited during the run, which takes minutes.
-        text = readme.with_table(readme.read_readme(args.readme), markdown_table(numbers.HEAD, rows), code_hash)
+        table = markdown_table(numbers.HEAD, [row for row in rows if row[0].startswith(numbers.README_ROWS)])
+        text = readme.with_table(readme.read_readme(args.readme), table, code_hash)
         args.readme.write_text(text, encoding="utf-8")
     print(args.output / "report.html")
     return 0

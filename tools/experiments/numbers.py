@@ -25,6 +25,14 @@ PAPER_REPORTS: Final = {
     "error_1.5_to_4_m": 0.08,
     "tags_end_m": 5.0,
 }
+# The headline's rows that the README has; the report has them all.
+README_ROWS: Final = (
+    "right pair of lights, all sensors",
+    "another pair taken, all sensors",
+    "range within",
+    "position error, median, 8 to 10 m",
+    "farthest pose in the lake",
+)
 # Errors that are drawn for each pose, for the median of errors at the bound.
 _DRAWS: Final = 100
 # A method reaches as far as the last bin in which at least this share of triggers gave a pose.
