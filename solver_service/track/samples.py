@@ -99,13 +99,15 @@ class Samples:
             return np.array((start_s, end_s)), np.zeros((2, 13)), np.zeros(1, dtype=bool)
         t = self._t[:last]
         first, stop = int(t.searchsorted(start_s, side="right")), int(t.searchsorted(end_s, side="left"))
-        grid: Floats = np.empty(stop - first + 2)
-        at: Floats = np.empty((stop - first + 2, 13))
+        # Where both times are that of one sample, the first after it is past the last before it.
+        points = max(stop - first, 0) + 2
+        grid: Floats = np.empty(points)
+        at: Floats = np.empty((points, 13))
         grid[0], grid[1:-1], grid[-1] = start_s, t[first:stop], end_s
         at[0], at[-1] = self._interpolated(start_s, first, last), self._interpolated(end_s, stop, last)
         at[1:-1] = self._values[first:stop]
         # An interval is told where the samples on its two sides are near each other.
-        sides = t.take(np.arange(first - 1, stop + 1), mode="clip")
+        sides = t.take(np.arange(first - 1, first + points - 1), mode="clip")
         told: Bools = sides[1:] - sides[:-1] < GAP_S
         if start_s < t[0] or end_s > t[-1]:
             late = np.maximum(grid[1:] - t[-1], 0.0) + np.maximum(t[0] - grid[:-1], 0.0)
