@@ -31,6 +31,7 @@ LIVE_NS: Final = 60 * S_NS
 STAMPED_BYTES: Final = 65536
 
 KeyExprs: TypeAlias = str | tuple[str, ...]
+OnArrival: TypeAlias = Callable[[str, bytes], None]
 
 log = logging.getLogger(__name__)
 
@@ -137,7 +138,13 @@ class Bus(ABC):
 
     @abstractmethod
     def subscribe(
-        self, keys: KeyExprs, handle: Callable[[Received], None], *, capacity: int = 1024, history: bool = True
+        self,
+        keys: KeyExprs,
+        handle: Callable[[Received], None],
+        *,
+        capacity: int = 1024,
+        history: bool = True,
+        on_arrival: OnArrival | None = None,
     ) -> Subscription:
         """Pass every message on these keys (`*`: one chunk, `**`: any number) to handle, one at a time.
 
@@ -148,6 +155,8 @@ class Bus(ABC):
         Without history, only messages sent from now on are passed, as they arrive.
         Beyond `capacity` the oldest message is dropped and counted. An exception in handle ends the subscription's
         thread and becomes the bus's failure.
+        on_arrival is called with key and payload of each message as it comes, before it waits for the handler or for an
+        earlier message: by several threads, more than once for one that comes more than once. It must not wait.
         """
 
     @abstractmethod

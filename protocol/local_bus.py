@@ -10,6 +10,7 @@ from buddyline.protocol.bus import (
     CACHE_S,
     Bus,
     KeyExprs,
+    OnArrival,
     Publisher,
     Received,
     Subscription,
@@ -102,9 +103,16 @@ class LocalSubscription:
     missed = 0
 
     def __init__(
-        self, network: LocalNetwork, key_exprs: Sequence[str], delivery: Delivery[Received], *, history: bool
+        self,
+        network: LocalNetwork,
+        key_exprs: Sequence[str],
+        delivery: Delivery[Received],
+        *,
+        history: bool,
+        on_arrival: OnArrival | None,
     ) -> None:
         self.joined = False
+        self._on_arrival = on_arrival
         self._key_exprs = key_exprs
         self._network = network
         self._delivery = delivery
@@ -121,6 +129,8 @@ class LocalSubscription:
 
     def offer(self, publisher: LocalPublisher, payload: bytes, *, again: bool = False) -> None:
         """Queue a message of publisher; again: if it is wanted."""
+        if self._on_arrival is not None:
+            self._on_arrival(publisher.key, payload)
         if publisher.topic.repeated and not self._repeats.is_wanted(publisher.key, payload, publisher, again=again):
             return
         now_ns = self._network.clock.now_ns()
@@ -177,11 +187,17 @@ class LocalBus(Bus):
         return publisher
 
     def subscribe(
-        self, keys: KeyExprs, handle: Callable[[Received], None], *, capacity: int = 1024, history: bool = True
+        self,
+        keys: KeyExprs,
+        handle: Callable[[Received], None],
+        *,
+        capacity: int = 1024,
+        history: bool = True,
+        on_arrival: OnArrival | None = None,
     ) -> Subscription:
         """Pass every message on these keys to handle, one at a time; see protocol.bus.Bus.subscribe."""
         delivery = Delivery(f"bus {' '.join(each_of(keys))}", handle, capacity, self._failures)
-        subscription = LocalSubscription(self._network, each_of(keys), delivery, history=history)
+        subscription = LocalSubscription(self._network, each_of(keys), delivery, history=history, on_arrival=on_arrival)
         with self._network.lock:
             if history:
                 publishers = [p for p in self._network.publishers if subscription.takes(p.key)]

@@ -104,11 +104,21 @@ class AnsweredPair:
         self.up_to_ns = max((one.stamp_ns for one in in_order), default=0)
         # An outcome that came `late` says nothing of other triggers.
         self._late = {one.trigger for one in said if not one.in_order}
+        # Without an answer, though later triggers have one.
+        self._open: set[int] = set()
         self._withheld: deque[Outcome] = deque(maxlen=MAX_WITHHELD)
 
-    def answers(self, trigger: int) -> bool:
-        """Return whether a trigger's outcome was published before."""
-        return trigger in self._late or (self._up_to is not None and trigger <= self._up_to)
+    def expect(self, triggers: Iterable[int], noted: Iterable[Answer]) -> set[int]:
+        """Return those triggers that have no answer; from now on each is due, also before later ones that have one.
+
+        noted: all answers since the first of them that is in order, by the solvers that had a frame of these triggers.
+        If another solver has answered since, by `said`, it may have answered all up to there.
+        """
+        known = {one.trigger: one.in_order for one in noted}
+        in_order = [trigger for trigger, is_in_order in known.items() if is_in_order]
+        before = self._up_to if self._up_to != max(in_order, default=None) else min(in_order, default=None)
+        self._open = {one for one in triggers if one not in known and (before is None or one > before)} - self._late
+        return set(self._open)
 
     def give_up(self, trigger: int) -> None:
         """Note a trigger that was answered without its frames; they may still come."""
@@ -116,6 +126,9 @@ class AnsweredPair:
 
     def is_due(self, outcome: Outcome) -> bool:
         """Return whether an outcome is to be published; if not, withhold it."""
+        if outcome.trigger in self._open:
+            self._open.remove(outcome.trigger)
+            return True
         if self._up_to is not None and outcome.trigger <= self._up_to:
             self._withheld.append(outcome)
             return False

@@ -6,6 +6,7 @@ import contextlib
 import logging
 import os
 import re
+import threading
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -16,10 +17,10 @@ import msgspec
 from buddyline.protocol.bus import CACHE_S
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.codec import encode
-from buddyline.protocol.messages import Candidates, Message
+from buddyline.protocol.messages import Message
 from buddyline.protocol.statusfile import runtime_directory
 from buddyline.protocol.topics import POSE, REJECTED, key_of, parse_key
-from buddyline.solver_service.answered import Answer, Outcome, answer_of
+from buddyline.solver_service.answered import THIS_DIVE_NS, Answer, Outcome, answer_of
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +40,7 @@ class Noted:
     """What earlier solvers at this hub have received and said.
 
     said: answers, in their order. recent: key and payload of the outcomes of the last minute, as they were published.
-    frames: node, trigger and stamp of the frames of the last minute.
+    frames: node, trigger and stamp of the frames of this dive.
     """
 
     said: list[Answer] = field(default_factory=list)
@@ -53,7 +54,8 @@ class Journal:
     A write error is logged once, and the solver goes on.
 
     A line is in the system's hands as soon as it is written, so it outlives the process; a power cut ends the dive for
-    nodes and solver alike. instance: of solvers that share the work, each has its own file, and reads those of all.
+    nodes and solver alike. Several threads may add. instance: of solvers that share the work, each has its own file,
+    and reads those of all.
     """
 
     def __init__(self, path: Path, instance: str = "") -> None:
@@ -64,6 +66,7 @@ class Journal:
         self._file: int | None = None
         self._bytes = 0
         self._failed = False
+        self._lock = threading.Lock()
 
     @classmethod
     def of(cls, endpoint: str, namespace: str = "", instance: str = "") -> Journal | None:
@@ -85,7 +88,7 @@ class Journal:
                 words = payload.split()
                 if len(words) == FRAME_WORDS and words[-1] == END and all(word.isdigit() for word in words[1:3]):
                     frame = words[0].decode("ascii", "replace"), int(words[1]), int(words[2])
-                    past.frames += [frame] * (abs(now_ns - frame[2]) < CACHE_S * S_NS)
+                    past.frames += [frame] * (abs(now_ns - frame[2]) < THIS_DIVE_NS)
                 continue
             try:
                 one = self._decoder.decode(payload)
@@ -121,13 +124,14 @@ class Journal:
         lines = [_line(key_of(message), encode(message)) for message in outcomes]
         if lines:
             self._write(b"".join(lines))
-        for message, line in zip(outcomes, lines, strict=True):
-            if answer_of(message).in_order:
-                self._last[message.node_a, message.node_b] = line
+        with self._lock:
+            for message, line in zip(outcomes, lines, strict=True):
+                if answer_of(message).in_order:
+                    self._last[message.node_a, message.node_b] = line
 
-    def add_frame(self, frame: Candidates) -> None:
+    def add_frame(self, node: str, trigger: int, stamp_ns: int) -> None:
         """Note a frame that has been received: its trigger will have an outcome, also if its node ends too."""
-        self._write(b"%s %s %d %d %s\n" % (FRAME, frame.node.encode(), frame.trigger, frame.stamp_ns, END))
+        self._write(b"%s %s %d %d %s\n" % (FRAME, node.encode(), trigger, stamp_ns, END))
 
     def close(self) -> None:
         """Close the file."""
@@ -136,18 +140,19 @@ class Journal:
             self._file = None
 
     def _write(self, text: bytes) -> None:
-        try:
-            if self._file is None:
-                self._file = self._open()
-            if self._bytes + len(text) > MOST_BYTES:
-                self._file = self._begin()
-            self._bytes += os.write(self._file, text)
-        except OSError as error:
-            if not self._failed:
-                log.warning("solver: journal %s cannot be written: %s", self.path, error.strerror)
-            self._failed = True
-        else:
-            self._failed = False
+        with self._lock:
+            try:
+                if self._file is None:
+                    self._file = self._open()
+                if self._bytes + len(text) > MOST_BYTES:
+                    self._file = self._begin()
+                self._bytes += os.write(self._file, text)
+            except OSError as error:
+                if not self._failed:
+                    log.warning("solver: journal %s cannot be written: %s", self.path, error.strerror)
+                self._failed = True
+            else:
+                self._failed = False
 
     def _open(self) -> int:
         """Go on with the file; the solver before may have been killed within a line."""

@@ -6,10 +6,11 @@ import logging
 import threading
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+import msgspec
 from buddyline.protocol.clock import Clock, SystemClock
 from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.errors import MessageError
@@ -56,6 +57,14 @@ WAIT_S: Final = 1.0
 OWED_S: Final = 10.0
 
 
+class _Frame(msgspec.Struct):
+    trigger: int
+    stamp_ns: int
+
+
+_FRAME: Final = msgspec.json.Decoder(_Frame)
+
+
 class SolverService(Service):
     """Solves the configured pairs, or every pair of nodes that appears."""
 
@@ -96,6 +105,8 @@ class SolverService(Service):
         # Triggers of which an earlier solver had a frame, and that have no outcome yet; with the frame's stamp.
         self._owed: dict[tuple[PairId, int], int] = {}
         self._owed_until_s = 0.0
+        # Up to this stamp the frames of a node had come, and were noted or answered, before this solver came.
+        self._answered_to_ns: dict[str, int] = {}
         self._words_s = 0.0
 
     def start(self) -> None:
@@ -221,16 +232,31 @@ class SolverService(Service):
         if self._work is None:
             past, said = self._read_past(bus)
             self._answered.know(said)
+            self._expect_again(past, said)
         else:
             bus.subscribe((POSE.key_any(), REJECTED.key_any()), self._hear, history=False)
             log.info("solver: shares the work of this hub as %s", self._work.sharing.instance)
         self._declare()
         self._repeat(past.recent)
-        self._expect_again(past)
         # One subscription for all topics, so that cached messages come in the order of their stamps. A frame would
         # not wait for an attitude that comes a minute later.
-        bus.subscribe(tuple(topic.key_any() for topic in (*SOLVED_FROM, IMU_MEANS)), self.receive, capacity=32768)
+        bus.subscribe(
+            tuple(topic.key_any() for topic in (*SOLVED_FROM, IMU_MEANS)),
+            self.receive,
+            capacity=32768,
+            on_arrival=self._note_arrival if self._journal is not None and self._work is None else None,
+        )
         self._joined_ns = self._attached_ns = self.clock.now_ns()
+
+    def _note_arrival(self, key: str, payload: bytes) -> None:
+        """Note a frame as soon as it has come: while there is a backlog, this solver may be killed before its turn."""
+        parsed = parse_key(key)
+        if self._journal is not None and parsed is not None and parsed[0] is CANDIDATES:
+            (node,) = parsed[1]
+            with suppress(msgspec.DecodeError, UnicodeDecodeError):
+                frame = _FRAME.decode(payload)
+                if frame.stamp_ns > self._answered_to_ns.get(node, -1):
+                    self._journal.add_frame(node, frame.trigger, frame.stamp_ns)
 
     def receive(self, received: Received) -> None:
         """Take one message from the bus; a bad one is counted and reported. At the end a backlog is left to the next.
@@ -289,8 +315,6 @@ class SolverService(Service):
             self._joined_ns = 0
         elif self._answered.is_over(self.core.pairs_of(frame.node), frame.stamp_ns, self.clock.now_ns()):
             return
-        if self._journal is not None and self._work is None:
-            self._journal.add_frame(frame)
         self._handle(frame)
         if new and self._is_of_now(frame):
             pairs = self.core.pairs_of(frame.node)
@@ -349,17 +373,20 @@ class SolverService(Service):
                 self._publisher_of(parsed[0], *parsed[1])
             self._publishers[key].repeat(payload)
 
-    def _expect_again(self, past: Noted) -> None:
+    def _expect_again(self, past: Noted, said: Iterable[Answer]) -> None:
         """Note of which triggers an earlier solver has received a frame and said nothing.
 
         Their nodes have the frames in their caches, unless they have ended too.
         """
-        pairs = {(one.node_a, one.node_b) for one in past.said}
-        for node, trigger, stamp_ns in past.frames:
-            for pair in pairs:
-                if node in pair and not self._answered.pair(pair).answers(trigger):
-                    self._owed[pair, trigger] = stamp_ns
+        for pair, noted in _by_pair(past.said).items():
+            stamps_ns = {trigger: stamp_ns for node, trigger, stamp_ns in past.frames if node in pair}
+            for trigger in self._answered.pair(pair).expect(stamps_ns, noted):
+                self._owed[pair, trigger] = stamps_ns[trigger]
         self._owed_until_s = time.monotonic() + OWED_S
+        for pair in _by_pair(said):
+            for node in pair:
+                up_to_ns = self._answered.pair(pair).up_to_ns
+                self._answered_to_ns[node] = min(up_to_ns, self._answered_to_ns.get(node, up_to_ns))
 
     def _give_up_owed(self) -> None:
         """Answer the triggers whose frames have not come again."""

@@ -15,6 +15,7 @@ from buddyline.protocol.bus import (
     CACHE_S,
     Bus,
     KeyExprs,
+    OnArrival,
     Publisher,
     Received,
     Subscription,
@@ -215,14 +216,27 @@ class ZenohBus(Bus):
         return wrapped
 
     def subscribe(
-        self, keys: KeyExprs, handle: Callable[[Received], None], *, capacity: int = 1024, history: bool = True
+        self,
+        keys: KeyExprs,
+        handle: Callable[[Received], None],
+        *,
+        capacity: int = 1024,
+        history: bool = True,
+        on_arrival: OnArrival | None = None,
     ) -> Subscription:
         """Pass every message on these keys to handle, one at a time; see protocol.bus.Bus.subscribe."""
         key_exprs = each_of(keys)
         delivery = Delivery(f"bus {' '.join(key_exprs)}", handle, capacity, self._failures)
         limit = RateLimit(is_off=lambda: bool(self._players))
         subscription = ZenohSubscription(
-            self._session, key_exprs, delivery, limit, history=history, clock=self.clock, failures=self._failures
+            self._session,
+            key_exprs,
+            delivery,
+            limit,
+            history=history,
+            clock=self.clock,
+            failures=self._failures,
+            on_arrival=on_arrival,
         )
         with self._lock:
             self._subscriptions.append(subscription)

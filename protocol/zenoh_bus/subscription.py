@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
 import zenoh
-from buddyline.protocol.bus import Received, held_order, queue_of
+from buddyline.protocol.bus import OnArrival, Received, held_order, queue_of
 from buddyline.protocol.clock import Clock
 from buddyline.protocol.delivery import CLOSE_S, Delivery, FailureLatch, Repeats
 from buddyline.protocol.held import open_page
@@ -63,8 +63,10 @@ class ZenohSubscription:
         history: bool,
         clock: Clock,
         failures: FailureLatch,
+        on_arrival: OnArrival | None = None,
     ) -> None:
         self._session = session
+        self._on_arrival = on_arrival
         self._delivery = delivery
         self._limit = limit
         self._history = history
@@ -160,6 +162,7 @@ class ZenohSubscription:
 
     def _accept(self, arrived: Arrived) -> None:
         """Deliver a message, or hold it until the publisher's missing earlier messages are fetched."""
+        self._note(arrived)
         if arrived.number is None:
             self._deliver(arrived)
             return
@@ -226,7 +229,13 @@ class ZenohSubscription:
             missing = {number for number in missing if number not in found and number >= oldest.get(source, 0)}
             if not missing or self._stop.wait(RETRY_S):
                 break
+        for arrived in found.values():
+            self._note(arrived)
         return list(found.items())
+
+    def _note(self, arrived: Arrived) -> None:
+        if self._on_arrival is not None:
+            self._on_arrival(arrived.source.key, arrived.payload)
 
     def _query(self, selector: str) -> tuple[dict[PublisherId, int], list[Arrived]]:
         """Return the numbers of the oldest messages that there are, by publisher, and the messages that they answer."""

@@ -8,7 +8,7 @@ from buddyline.protocol.clock import S_NS, ManualClock
 from buddyline.protocol.codec import decode, encode
 from buddyline.protocol.local_bus import LocalNetwork, LocalPublisher
 from buddyline.protocol.messages import Candidates, Rejected
-from buddyline.protocol.topics import key_of, parse_key
+from buddyline.protocol.topics import CANDIDATES, key_of, parse_key
 from buddyline.solver_service import service as service_module
 from buddyline.solver_service.answered import Answered, AnsweredPair, answer_of
 from buddyline.solver_service.config import SolverConfig
@@ -156,6 +156,12 @@ def test_what_a_link_held_up_is_not_answered_again(player):
     assert bool(outcomes) is player
 
 
+def feed(service, message):
+    """Pass a message to a solver as the bus does."""
+    service._note_arrival(key_of(message), encode(message))
+    service.receive(Received(key_of(message), encode(message), service.clock.now_ns(), ""))
+
+
 def test_what_a_killed_solver_could_not_tell_the_next_one_tells(tmp_path, monkeypatch):
     """Its last outcomes went into a hub that was dying; of one trigger it had one frame, whose node is gone too."""
     messages, _ = dive_messages(seconds=4.0, period_ns=2 * PERIOD_NS)
@@ -184,7 +190,7 @@ def test_what_a_killed_solver_could_not_tell_the_next_one_tells(tmp_path, monkey
                 deaf = i > len(messages) // 2
                 clock.set_ns(clock.now_ns() + 1)
                 if message is not last:
-                    service.receive(Received(key_of(message), encode(message), clock.now_ns(), ""))
+                    feed(service, message)
             assert service.core.pending
             until(lambda: outcomes)
             heard = len(outcomes)
@@ -197,7 +203,7 @@ def test_what_a_killed_solver_could_not_tell_the_next_one_tells(tmp_path, monkey
                 # They come after all: nothing is answered again.
                 for message in messages:
                     clock.set_ns(clock.now_ns() + 1)
-                    service.receive(Received(key_of(message), encode(message), clock.now_ns(), ""))
+                    feed(service, message)
                 with service._lock:
                     service._publish(service.core.flush())
         until(lambda: payload_trigger(outcomes[-1]) == last.trigger)
@@ -205,3 +211,63 @@ def test_what_a_killed_solver_could_not_tell_the_next_one_tells(tmp_path, monkey
     counts = Counter(payload_trigger(one) for one in outcomes)
     assert set(counts) == {frame.trigger for frame in frames}
     assert set(counts.values()) == {1}
+
+
+def test_what_waited_when_a_solver_was_killed_has_an_outcome(tmp_path, monkeypatch):
+    """Its backlog ends with it, and so do the nodes that had the frames. The next solver is killed soon, too."""
+    messages, _ = dive_messages(seconds=6.0, sensors=False, period_ns=2 * PERIOD_NS)
+    frames = sorted((one for one in messages if isinstance(one, Candidates)), key=lambda frame: frame.stamp_ns)
+    clock = ManualClock(frames[-1].stamp_ns + S_NS)
+    network, outcomes = LocalNetwork(clock), []
+    config = SolverConfig(nodes=["a", "b"], journal=str(tmp_path / "answered"))
+    third = len(frames) // 6 * 2
+
+    def nodes_and_solver(bus, part, *, stuck_from):
+        """Nodes send these frames and end; the solver handles none from one on, and is killed."""
+        service = SolverService(config, clock=clock)
+        service.attach(bus)
+        with network.connect() as nodes:
+            publishers = {node: nodes.publisher(CANDIDATES, node) for node in ("a", "b")}
+            for k, frame in enumerate(part):
+                clock.set_ns(clock.now_ns() + 1)
+                if k == stuck_from:
+                    until(lambda: service._handled == stuck_from)
+                    service._lock.acquire()
+                publishers[frame.node].put(frame)
+            if len(part) == stuck_from:
+                until(lambda: service._handled == stuck_from)
+                service._lock.acquire()
+        service.stop.set()
+        service._publish(service.core.flush() if len(part) == stuck_from else [])
+        service._lock.release()
+
+    with network.connect() as viewer:
+        viewer.subscribe(("buddyline/pair/*/*/pose", "buddyline/pair/*/*/rejected"), outcomes.append, capacity=10_000)
+        with network.connect() as bus:
+            nodes_and_solver(bus, frames[: 2 * third], stuck_from=third)
+        with network.connect() as bus:
+            nodes_and_solver(bus, frames[2 * third :], stuck_from=len(frames) - 2 * third)
+        monkeypatch.setattr(service_module, "OWED_S", 0.0)
+        for _ in range(2):
+            with network.connect() as bus:
+                service = SolverService(config, clock=clock)
+                service.attach(bus)
+                service.tick(status_due=False)
+        until(lambda: len(outcomes) >= len(frames) // 2)
+    counts = Counter(payload_trigger(one) for one in outcomes)
+    assert set(counts) == {frame.trigger for frame in frames}
+    assert set(counts.values()) == {1}
+    late = {payload_trigger(one) for one in outcomes if b'"late"' in one.payload}
+    waited = {frame.trigger for frame in frames[third : 2 * third]}
+    assert waited <= late < set(counts)
+
+
+def test_what_another_solver_may_have_answered_is_not_expected():
+    noted = [answer_of(outcome(trigger)) for trigger in (5, 6, 9)] + [answer_of(outcome(2, reason="late"))]
+    triggers = (1, 2, 4, 5, 7, 8, 9, 10)
+    assert AnsweredPair([answer_of(outcome(9))]).expect(triggers, noted) == {7, 8, 10}
+    # What the hub holds is of another: it has answered up to 9, in its order.
+    assert AnsweredPair([answer_of(outcome(9))]).expect(triggers, noted[:2]) == {10}
+    one = AnsweredPair([answer_of(outcome(9))])
+    one.expect(triggers, noted)
+    assert [one.is_due(outcome(trigger)) for trigger in (6, 7, 7, 10)] == [False, True, False, True]

@@ -42,13 +42,13 @@ def test_the_last_outcome_of_each_pair_is_read_back(tmp_path):
     assert kept(path) == {("a", "b"): 5, ("a", "c"): 9}
 
 
-def test_outcomes_of_the_last_minute_and_frames_are_read_back_as_they_were(tmp_path):
+def test_outcomes_of_the_last_minute_and_frames_of_this_dive_are_read_back_as_they_were(tmp_path):
     path = tmp_path / "solver.answered"
     one = Journal(path)
     said = [outcome(1, ago_s=70), outcome(2, ago_s=50), outcome(3, reason="late", ago_s=1)]
     one.add(said[:2])
-    for each in (frame(2), frame(1, ago_s=70), frame(3)):
-        one.add_frame(each)
+    for each in (frame(2), frame(1, ago_s=601), frame(3)):
+        one.add_frame(each.node, each.trigger, each.stamp_ns)
     one.add(said[2:])
     past = Journal(path).read(NOW_NS)
     assert past.said == [answer_of(one) for one in said]
@@ -60,7 +60,7 @@ def test_one_that_takes_over_a_pair_reads_of_no_other(tmp_path):
     path = tmp_path / "solver.answered"
     one = Journal(path)
     one.add([outcome(3), outcome(4, ("a", "c"))])
-    one.add_frame(frame(3))
+    one.add_frame("a", 3, frame(3).stamp_ns)
     past = Journal(path).read(NOW_NS, [("a", "c")])
     assert past.said == [answer_of(outcome(4, ("a", "c")))]
     assert past.frames == []
@@ -82,7 +82,7 @@ def test_it_stays_small(tmp_path, monkeypatch):
     one.add([outcome(7, ("a", "c"))])
     for trigger in range(100):
         one.add([outcome(trigger)])
-        one.add_frame(frame(trigger))
+        one.add_frame("a", trigger, frame(trigger).stamp_ns)
         assert path.stat().st_size <= 2000
     assert kept(path) == {("a", "b"): 99, ("a", "c"): 7}
     assert sorted(file.name for file in tmp_path.iterdir()) == ["solver.answered", "solver.answered~"]
