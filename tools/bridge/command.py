@@ -28,6 +28,9 @@ log = logging.getLogger(__name__)
 DEFAULT_RATE_HZ: Final = 10.0
 NMEA_RATE_HZ: Final = 2.0
 HEARTBEAT_S: Final = 1.0
+# The autopilot takes an origin only once its filter runs, and keeps the first: it is given again with every third
+# heartbeat, because datagrams get lost and autopilots are restarted.
+ORIGIN_EVERY: Final = 3
 MAX_DATAGRAM: Final = 65535
 
 
@@ -60,7 +63,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     out.add_argument("--system", type=int, default=1, metavar="ID", help="the vehicle's MAVLink system; default: 1")
     out.add_argument("--rate", type=float, default=DEFAULT_RATE_HZ, metavar="HZ", help="at most; default: %(default)s")
     out.add_argument(
-        "--set-origin", action="store_true", help="give the autopilot the reference's place as its origin, once"
+        "--set-origin",
+        action="store_true",
+        help="give the autopilot the reference's first place as its origin, every 3 s",
     )
     out.add_argument("--nmea", metavar="HOST:PORT", help="a chart plotter, by UDP")
     out.add_argument("--http", metavar="HOST:PORT", help="serve JSON there, in the manner of Water Linked's UGPS")
@@ -141,7 +146,9 @@ class Bridge:
         self._to_mavlink = Datagrams("--mavlink", args.mavlink) if args.mavlink else None
         self._to_nmea = Datagrams("--nmea", args.nmea) if args.nmea else None
         self._boat = _receiver("--boat", args.boat) if args.boat else None
-        self._origin_due: bool = args.set_origin
+        self._gives_origin: bool = args.set_origin
+        self._origin: GeoPoint | None = None
+        self._ticks = 0
         self._least_ns = round(1e9 / args.rate)
         self._sent_ns = self._sent_nmea_ns = 0
         self._said = self._why = ""
@@ -167,14 +174,11 @@ class Bridge:
         earth = on_earth(placed, place) if place is not None and placed.is_north_true else None
         self._state.place(placed, earth, place)
         # A tenth of slack: a source at just this rate is not halved by its jitter.
-        if self._translation is not None and self._to_mavlink is not None:
-            if self._origin_due and place is not None:
-                self._to_mavlink.send(self._translation.origin(place))
-                self._origin_due = False
-            if placed.stamp_ns - self._sent_ns >= 0.9 * self._least_ns:
-                self._sent_ns = placed.stamp_ns
-                for packet in self._translation.packets(placed, earth):
-                    self._to_mavlink.send(packet)
+        due = placed.stamp_ns - self._sent_ns >= 0.9 * self._least_ns
+        if self._translation is not None and self._to_mavlink is not None and due:
+            self._sent_ns = placed.stamp_ns
+            for packet in self._translation.packets(placed, earth):
+                self._to_mavlink.send(packet)
         if self._to_nmea is not None and placed.stamp_ns - self._sent_nmea_ns >= 0.9e9 / NMEA_RATE_HZ:
             self._sent_nmea_ns = placed.stamp_ns
             self._to_nmea.send("".join(sentences(placed, earth)).encode("ascii"))
@@ -192,6 +196,11 @@ class Bridge:
         with self._lock:
             if self._translation is not None and self._to_mavlink is not None:
                 self._to_mavlink.send(self._translation.heartbeat())
+                if self._gives_origin and self._origin is None:
+                    self._origin = self._present_place()
+                if self._origin is not None and self._ticks % ORIGIN_EVERY == 0:
+                    self._to_mavlink.send(self._translation.origin(self._origin))
+            self._ticks += 1
             why = self._placing.why or self._why
         if why != self._said:
             self._said = why
