@@ -155,6 +155,7 @@ class TestFrames:
             first = told(one, "figures")
             assert first["reset"] is True
             assert first["banner"]["level"] == "ok"
+            assert first["banner"]["text"].startswith("All is well")
             assert "3.00 m" in first["figures"]
             assert {node["id"] for node in first["scene"]["nodes"]} == {"a", "b"}
             assert len(first["points"]) == 15
@@ -287,6 +288,7 @@ class TestDive:
         assert jumped
         frame = Viewer(live=False).frame(dive.step([])[0], now_ns)
         assert frame["banner"]["level"] == "problem"
+        assert frame["banner"]["text"].startswith("Stored dive. No pose: ")
         assert "more than one arrangement fits" in frame["health"]
         assert max(point[0] for point in frame["points"]) <= now_ns / 1e6
         told_once = dive.playback()

@@ -76,7 +76,9 @@ class Viewer:
         texts = self._tick % TEXTS_EVERY == 0
         if self._tick % BANNER_EVERY == 0:
             first = findings(picture, now_ns, live=self._live)[0]
-            banner = {"level": first.level, "text": sentence(first, now_ns), "advice": first.advice}
+            # Deck mode has no other sign that this is not now.
+            text = f"{'' if self._live else 'Stored dive. '}{sentence(first, now_ns)}"
+            banner = {"level": first.level, "text": text, "advice": first.advice}
             # Below a banner that is green no longer nothing else may say that all is well.
             texts |= self._told.get("banner", banner)["level"] != first.level
             self._tell(said, "banner", banner)
