@@ -104,7 +104,10 @@ class SolverService(Service):
         self._player = False
         # Triggers of which an earlier solver had a frame, and that have no outcome yet; with the frame's stamp.
         self._owed: dict[tuple[PairId, int], int] = {}
+        self._owed_triggers: set[int] = set()
         self._owed_until_s = 0.0
+        # Node and trigger of frames of such triggers that have come, and wait for their turn or have had it.
+        self._come_again: set[tuple[str, int]] = set()
         # Up to this stamp the frames of a node had come, and were noted or answered, before this solver came.
         self._answered_to_ns: dict[str, int] = {}
         self._words_s = 0.0
@@ -255,6 +258,8 @@ class SolverService(Service):
             (node,) = parsed[1]
             with suppress(msgspec.DecodeError, UnicodeDecodeError):
                 frame = _FRAME.decode(payload)
+                if frame.trigger in self._owed_triggers:
+                    self._come_again.add((node, frame.trigger))
                 if frame.stamp_ns > self._answered_to_ns.get(node, -1):
                     self._journal.add_frame(node, frame.trigger, frame.stamp_ns)
 
@@ -314,6 +319,7 @@ class SolverService(Service):
             # All later frames are new too, even if the clock is set.
             self._joined_ns = 0
         elif self._answered.is_over(self.core.pairs_of(frame.node), frame.stamp_ns, self.clock.now_ns()):
+            self._come_again.discard((frame.node, frame.trigger))
             return
         self._handle(frame)
         if new and self._is_of_now(frame):
@@ -382,6 +388,7 @@ class SolverService(Service):
             stamps_ns = {trigger: stamp_ns for node, trigger, stamp_ns in past.frames if node in pair}
             for trigger in self._answered.pair(pair).expect(stamps_ns, noted):
                 self._owed[pair, trigger] = stamps_ns[trigger]
+        self._owed_triggers = {trigger for _, trigger in self._owed}
         self._owed_until_s = time.monotonic() + OWED_S
         for pair in _by_pair(said):
             for node in pair:
@@ -390,7 +397,11 @@ class SolverService(Service):
 
     def _give_up_owed(self) -> None:
         """Answer the triggers whose frames have not come again."""
-        owed, self._owed = self._owed, {}
+        owed = {
+            (pair, trigger): stamp_ns
+            for (pair, trigger), stamp_ns in self._owed.items()
+            if not any((node, trigger) in self._come_again for node in pair)
+        }
         detail = "its frames were lost with the solver and node that had them"
         outcomes = [
             Rejected(node_a=a, node_b=b, stamp_ns=stamp_ns, trigger=trigger, reason="late", detail=detail)
@@ -400,6 +411,7 @@ class SolverService(Service):
             self._publisher_of(REJECTED, outcome.node_a, outcome.node_b)
         self._publish(outcomes)
         for pair, trigger in owed:
+            self._owed.pop((pair, trigger), None)
             self._answered.pair(pair).give_up(trigger)
 
     def _read_past(self, bus: Bus, pairs: Iterable[PairId] | None = None) -> tuple[Noted, list[Answer]]:

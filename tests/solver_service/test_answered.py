@@ -262,6 +262,42 @@ def test_what_waited_when_a_solver_was_killed_has_an_outcome(tmp_path, monkeypat
     assert waited <= late < set(counts)
 
 
+def test_what_has_come_again_is_not_given_up_while_it_waits(tmp_path, monkeypatch):
+    """A solver on a busy machine takes longer than OWED_S to come to the frames that it has received."""
+    monkeypatch.setattr(service_module, "OWED_S", 0.0)
+    messages, _ = dive_messages(seconds=4.0, period_ns=2 * PERIOD_NS)
+    frames = [one for one in messages if isinstance(one, Candidates)]
+    last_ns = max(frame.stamp_ns for frame in frames)
+    clock = ManualClock(last_ns + S_NS)
+    config = SolverConfig(nodes=["a", "b"], journal=str(tmp_path / "answered"))
+    network, killed = LocalNetwork(clock), SolverService(config, clock=clock)
+    killed._journal.add([Rejected(node_a="a", node_b="b", stamp_ns=1, trigger=1, reason="ambiguous")])
+    for frame in frames:
+        killed._note_arrival(key_of(frame), encode(frame))
+    outcomes = []
+    with network.connect() as viewer, network.connect() as bus:
+        viewer.subscribe(("buddyline/pair/*/*/pose", "buddyline/pair/*/*/rejected"), outcomes.append, capacity=10_000)
+        service = SolverService(config, clock=clock)
+        service.attach(bus)
+        # The last frames were lost with their nodes.
+        come = [one for one in messages if not (isinstance(one, Candidates) and one.stamp_ns == last_ns)]
+        for message in come:
+            service._note_arrival(key_of(message), encode(message))
+        service.tick(status_due=False)
+        for message in come:
+            clock.set_ns(clock.now_ns() + 1)
+            service.receive(Received(key_of(message), encode(message), clock.now_ns(), ""))
+        with service._lock:
+            service._publish(service.core.flush())
+        until(lambda: len(outcomes) >= len(frames) // 2)
+    assert Counter(payload_trigger(one) for one in outcomes) == {frame.trigger: 1 for frame in frames}
+    assert [one.stamp_ns for one in map(opened, outcomes) if getattr(one, "reason", "") == "late"] == [last_ns]
+
+
+def opened(received):
+    return decode(received.payload, parse_key(received.key)[0].schema)
+
+
 def test_what_another_solver_may_have_answered_is_not_expected():
     noted = [answer_of(outcome(trigger)) for trigger in (5, 6, 9)] + [answer_of(outcome(2, reason="late"))]
     triggers = (1, 2, 4, 5, 7, 8, 9, 10)
