@@ -289,6 +289,7 @@ class ZenohBus(Bus):
         watch = ZenohWatch(self._session, delivery, self._failures)
         with self._lock:
             self._subscriptions.append(watch)
+            self._limits.append(watch.limit)
         return watch
 
     def others_alive(self, name: str = "**") -> set[str]:

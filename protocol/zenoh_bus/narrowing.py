@@ -27,7 +27,7 @@ class Narrowing:
     """The subscribers of a subscription: of all owners of keys, or for a time of those that do not flood.
 
     wanted: key expressions, and what accepts their samples. declare: makes the intake of a key expression. present: the
-    nodes that are on the bus.
+    nodes that are on the bus. narrow: what is left of a key expression if only these owners count.
     """
 
     def __init__(
@@ -37,8 +37,10 @@ class Narrowing:
         limit: RateLimit,
         present: Callable[[], set[str]],
         failures: FailureLatch,
+        narrow: Callable[[str, Sequence[str]], list[str]] | None = None,
     ) -> None:
         self._wanted = wanted
+        self._narrow = narrow or narrowed
         self._present = present
         self._declare = declare
         self._limit = limit
@@ -107,7 +109,7 @@ class Narrowing:
             self._intakes = [
                 self._declare(key_expr, accept)
                 for wanted, accept in self._wanted
-                for key_expr in ([wanted] if owners is None else narrowed(wanted, owners))
+                for key_expr in ([wanted] if owners is None else self._narrow(wanted, owners))
             ]
         # Both hear for a moment, so that nothing is missed; what comes twice is told apart by its number.
         for intake in before:

@@ -13,6 +13,7 @@ from buddyline.protocol.codec import payload_stamp_ns
 from buddyline.protocol.rate_limit import BURST_S, BYTES_BURST_S, MARGIN, MOST_BYTES_PER_S, RateLimit, most_hz
 from buddyline.protocol.security import PLAYER
 from buddyline.protocol.zenoh_bus import narrowing, open_hub
+from buddyline.protocol.zenoh_bus.alive import ALIVE, MAX_TOKENS
 from buddyline.protocol.zenoh_bus.narrowing import Narrowing, narrowed
 from buddyline.protocol.zenoh_bus.session import config_of
 from buddyline.protocol.zenoh_bus.settings import client_settings
@@ -206,3 +207,33 @@ def test_a_node_that_comes_while_another_is_shut_out_is_heard(monkeypatch: pytes
         late = node.publisher(topics.CANDIDATES, "d")
         node.declare_alive("node/d")
         until(lambda: late.put_bytes(b"{}") and inbox.payloads(late.key), 0.05)
+
+
+def test_a_client_that_comes_and_goes_without_end_is_shut_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is named, counted, and forgotten in the end; the others are seen all the time, and after it also new ones."""
+    monkeypatch.setattr(narrowing, "SHUT_OUT_S", 0.5)
+    endpoint, changes = free_endpoint(), list[tuple[str, bool]]()
+    with open_hub(endpoint), run_client(endpoint) as receiver, run_client(endpoint) as node:
+        watch = receiver.watch_alive(lambda name, alive: changes.append((name, alive)))
+        node.declare_alive("node/a")
+        until(lambda: ("node/a", True) in changes)
+        with zenoh.open(config_of(client_settings(endpoint, None))) as client:
+            tokens = []
+
+            def flood() -> bool:
+                tokens.extend(
+                    client.liveliness().declare_token(f"{ALIVE}/node/c/{len(tokens)}_{k}") for k in range(200)
+                )
+                return watch.dropped > 0
+
+            until(flood, 0.0)
+            assert len(tokens) >= 1000
+            assert "buddyline/node/c sends too much" in receiver.flood_problem()
+            node.withdraw_alive("node/a")
+            until(lambda: changes[-1] == ("node/a", False))
+            node.declare_alive("node/d")
+            until(lambda: ("node/d", True) in changes)
+            assert sum(map(len, watch._processes.values())) <= MAX_TOKENS  # type: ignore[attr-defined]
+        until(lambda: "node/c" not in watch._processes and changes[-1] == ("node/c", False))  # type: ignore[attr-defined]
+        assert watch._count == 1  # type: ignore[attr-defined]
+    assert {name for name, _ in changes} == {"node/a", "node/c", "node/d"}
