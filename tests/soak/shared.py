@@ -1,12 +1,18 @@
-"""Several solvers that share the work, and are killed again and again: `python -m tests.soak.shared --kills 20`.
+"""Several solvers that share the work: killed again and again, or with many nodes.
 
-Prints how many outcomes were missing or doubled, and for how long pairs had none. Exit status 1 where any was.
+    .venv/bin/python -m tests.soak.shared --kills 20 --track 0 --rate 5 --again 2      # in seven minutes
+    .venv/bin/python -m tests.soak.shared --kills 0 --seconds 60 --nodes 12 --teams 3 --solvers 1
+    .venv/bin/python -m tests.soak.shared --kills 0 --seconds 60 --nodes 12 --teams 3 --solvers 3 --track 0
+
+Prints how many outcomes were missing or doubled, for how long pairs had none after each kill, how long after its frames
+an outcome came, and what each process took of a core. Exit status 1 where any outcome was missing or doubled.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
+import os
 import random
 import signal
 import statistics
@@ -15,6 +21,7 @@ import tempfile
 import threading
 import time
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -27,6 +34,7 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Candidates, Message, NodePose, Rejected, RelativePose
 from buddyline.protocol.topics import NET_POSE, POSE, REJECTED, topic_of
 from buddyline.protocol.zenoh_bus import connect
+from buddyline.tools.measure.load import load_of
 from msgspec.structs import replace
 
 from tests.processes import Process, free_endpoint, until
@@ -38,11 +46,27 @@ REST_S = 6.0
 TAKEN_UP_S = 3.0
 
 
-def simulated(nodes: int, rate_hz: float, seconds: float, *, imu: bool) -> list[Message]:
-    """Return what nodes tell in a dive, in order of time."""
-    world = World(Scenario(seed=3, start_ns=START_NS, more_nodes=more_nodes(nodes), fixed_nodes=("a",)))
-    told = (one for _, _, one in simulation.messages(world, DivePlan(seconds=seconds, rate_hz=rate_hz, imu=imu)))
-    return [one for one in told if hasattr(one, "node") and not isinstance(one, NodePose)]
+def simulated(nodes: int, rate_hz: float, seconds: float, *, imu: bool, teams: int = 1) -> list[Message]:
+    """Return what nodes tell in a dive, in order of time. Teams of as many nodes each do not see each other."""
+    names = ("a", "b", *more_nodes(nodes))
+    size, told = nodes // teams, []
+    for team in range(teams):
+        of_team = names[team * size : (team + 1) * size]
+        fixed = of_team[:1] if team == 0 else ()
+        world = World(
+            Scenario(
+                seed=3 + team,
+                start_ns=START_NS,
+                node_a=of_team[0],
+                node_b=of_team[1],
+                more_nodes=of_team[2:],
+                fixed_nodes=fixed,
+            )
+        )
+        plan = DivePlan(seconds=seconds, rate_hz=rate_hz, imu=imu)
+        told += [one for _, _, one in simulation.messages(world, plan)]
+    kept = [one for one in told if hasattr(one, "node") and not isinstance(one, NodePose)]
+    return sorted(kept, key=lambda one: one.stamp_ns)
 
 
 def moved(message: Message, by_triggers: int, period_ns: int) -> Message:
@@ -53,15 +77,21 @@ def moved(message: Message, by_triggers: int, period_ns: int) -> Message:
 
 @dataclass
 class SolversTold:
-    """What the solvers have told: by pair and trigger, when each outcome came; when each node of the net was told."""
+    """What the solvers have told: by pair and trigger, when each outcome came; when each node of the net was told.
+
+    late_s: how long after its stamp each pose, rejection and node of the net came.
+    """
 
     outcomes: dict[tuple[str, str, int], list[float]] = field(default_factory=lambda: defaultdict(list))
     poses: int = 0
     net: list[float] = field(default_factory=list)
+    late_s: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
 
     def take(self, received: Received) -> None:
         """Take one message from the bus."""
         message = received.open().message
+        assert isinstance(message, RelativePose | Rejected | NodePose)
+        self.late_s[type(message).__name__].append((time.time_ns() - message.stamp_ns) / S_NS)
         if isinstance(message, RelativePose | Rejected):
             self.poses += isinstance(message, RelativePose)
             self.outcomes[message.node_a, message.node_b, message.trigger].append(time.monotonic())
@@ -139,13 +169,28 @@ class SharedSoak:
     gaps_s: list[float]
     joined_s: list[float]
     net_rows: int
+    late_s: dict[str, tuple[float, float, float]]
+    cores: dict[str, float]
 
 
 def soak(
-    work: Path, kills: int, *, solvers: int, nodes: int, rate_hz: float, track_hz: float, again_s: float, seed: int = 1
+    work: Path,
+    kills: int,
+    *,
+    solvers: int,
+    nodes: int,
+    rate_hz: float,
+    track_hz: float,
+    again_s: float,
+    seed: int = 1,
+    teams: int = 1,
+    seconds: float = 0.0,
 ) -> SharedSoak:
-    """Run the solvers, kill one after another with -9, and start it again. track_hz: 0 for neither tracks nor net."""
-    messages = simulated(nodes, rate_hz, 20.0, imu=track_hz > 0)
+    """Run the solvers for some seconds, then kill one after another with -9, and start it again.
+
+    track_hz: 0 for neither tracks nor net. How late things come and what processes take is of those seconds.
+    """
+    messages = simulated(nodes, rate_hz, 20.0, imu=track_hz > 0, teams=teams)
     config = work / "solver.toml"
     config.write_text(f'share = true\njournal = "{work / "answered"}"\n[track]\nrate_hz = {track_hz}\n')
     pick = random.Random(seed)
@@ -166,6 +211,10 @@ def soak(
                 until(lambda: len({key[:2] for key in list(dive.told.outcomes)}) == pairs, 0.05)
                 until(lambda: dive.told.net or not track_hz, 0.05)
                 time.sleep(again_s)
+                cores = watch(
+                    dive.told, {"hub": hub, **{f"solver {i + 1}": one for i, one in enumerate(running)}}, seconds
+                )
+                late_s = {of: _spread(found) for of, found in dive.told.late_s.items() if found}
                 gaps_s, joined_s = [], []
                 for _ in range(kills):
                     killed = running.pop(pick.randrange(len(running)))
@@ -197,7 +246,30 @@ def soak(
         gaps_s=gaps_s,
         joined_s=joined_s,
         net_rows=len(dive.told.net),
+        late_s=late_s,
+        cores=cores,
     )
+
+
+def watch(told: SolversTold, processes: Mapping[str, Process], seconds: float) -> dict[str, float]:
+    """Let some seconds pass; give what each process took of a core, that which plays the nodes too.
+
+    told begins anew to count how late things come.
+    """
+    if not seconds:
+        return {}
+    pids = {name: one.pid for name, one in processes.items()} | {"nodes": os.getpid()}
+    told.late_s.clear()
+    before, began_s = {name: load_of(pid) for name, pid in pids.items()}, time.monotonic()
+    time.sleep(seconds)
+    span_s = time.monotonic() - began_s
+    return {name: (load_of(pid).cpu_s - before[name].cpu_s) / span_s for name, pid in pids.items()}
+
+
+def _spread(values: list[float]) -> tuple[float, float, float]:
+    """Give the median, the 95th percentile and the worst."""
+    found = sorted(values)
+    return found[len(found) // 2], found[min(round(0.95 * len(found)), len(found) - 1)], found[-1]
 
 
 def main() -> int:
@@ -210,6 +282,8 @@ def main() -> int:
     parser.add_argument("--again", type=float, default=3.0, help="s from a new solver's first task to the next kill")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--track", type=float, default=20.0, help="Hz; 0: neither tracks nor the network")
+    parser.add_argument("--teams", type=int, default=1, help="of as many nodes each, which do not see each other")
+    parser.add_argument("--seconds", type=float, default=0.0, help="before the first kill, to measure in")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         found = soak(
@@ -221,14 +295,24 @@ def main() -> int:
             track_hz=args.track,
             again_s=args.again,
             seed=args.seed,
+            teams=args.teams,
+            seconds=args.seconds,
         )
     print(msgspec.json.encode(found).decode())
     print(
         f"{len(found.gaps_s)} kills among {args.solvers}: of {found.triggers} outcomes {found.missing} missing, "
-        f"{found.doubled} doubled; longest time without one, of each kill: "
-        f"median {statistics.median(found.gaps_s):.2f} s, worst {max(found.gaps_s):.2f} s; while another one joins: "
-        f"median {statistics.median(found.joined_s):.2f} s, worst {max(found.joined_s):.2f} s"
+        f"{found.doubled} doubled"
     )
+    if found.gaps_s:
+        gaps, joined = (
+            f"median {statistics.median(of):.2f} s, worst {max(of):.2f} s" for of in (found.gaps_s, found.joined_s)
+        )
+        print(f"longest time without one, of each kill: {gaps}; while another one joins: {joined}")
+    if args.seconds:
+        for of, (median_s, most_s, worst_s) in found.late_s.items():
+            print(f"{of} after its stamp: median {median_s:.3f} s, 95 % {most_s:.3f} s, worst {worst_s:.3f} s")
+        print("of a core: " + ", ".join(f"{name} {share:.2f}" for name, share in found.cores.items()))
+        print(f"tasks that wanted a core in the last minute: {os.getloadavg()[0]:.1f} on {os.cpu_count()}")
     return 1 if found.missing or found.doubled else 0
 
 

@@ -1,9 +1,14 @@
 """`buddyline backfill`: the union of a topside recording and the nodes' logs, each message once, by time."""
 
+from contextlib import ExitStack
+
 import pytest
+from buddyline.node.sim.dive import messages as simulated
+from buddyline.node.sim.scenario import DivePlan, Scenario
+from buddyline.node.sim.world import World
 from buddyline.protocol.codec import encode
 from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
-from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Mark
+from buddyline.protocol.messages import Attitude, Candidates, CompressedImage, Depth, FoxgloveTime, Mark, NodeInfo
 from buddyline.protocol.topics import key_of
 from buddyline.tools.cli import main
 from msgspec.structs import replace
@@ -99,3 +104,32 @@ def test_a_backfilled_log_solves_like_the_nodes_own_logs(dive, tmp_path):
 
     assert results(tmp_path / "own.mcap")
     assert results(tmp_path / "filled.mcap") == results(tmp_path / "own.mcap")
+
+
+def test_a_team_is_completed_from_as_many_logs_as_there_are_nodes(tmp_path, capsys):
+    """The link of c was out for a second, that of d from a second on; d's log is missing at first."""
+    begin_ns = 1_764_000_000 * S_NS
+    world = World(Scenario(seed=7, start_ns=begin_ns, more_nodes=("c", "d")))
+    told = [message for _, _, message in simulated(world, DivePlan(seconds=3.0))]
+    messages = [message for message in told if isinstance(message, NodeInfo | Candidates | Attitude | Depth)]
+    out_s = {"c": (1.0, 2.0), "d": (1.0, 9.0)}
+    logs = {name: str(tmp_path / f"{name}.mcap") for name in ("topside", "a", "b", "c", "d")}
+    with ExitStack() as stack:
+        writers = {name: stack.enter_context(DiveLogWriter(path)) for name, path in logs.items()}
+        for message in messages:
+            writers[message.node].write_message(message)
+            from_s, to_s = out_s.get(message.node, (0.0, 0.0))
+            if not from_s <= (message.stamp_ns - begin_ns) / S_NS < to_s:
+                writers["topside"].write_message(message, message.stamp_ns + LATENCY_NS)
+    expected = sorted((key_of(message), message.stamp_ns) for message in messages)
+    for brought in (("a", "b", "c"), ("d", "b", "a", "c")):
+        out = tmp_path / f"{len(brought)}.mcap"
+        assert main(["backfill", logs["topside"], *(logs[node] for node in brought), "-o", str(out)]) == 0
+        found = sorted((record.key, record.publish_time_ns) for record in read(out))
+        assert found == [
+            one for one in expected if len(brought) == 4 or "/d/" not in one[0] or one[1] < begin_ns + S_NS
+        ]
+    said = capsys.readouterr().err
+    frames = sum(isinstance(message, Candidates) and message.node == "d" for message in messages)
+    early = sum(isinstance(one, Candidates) and one.node == "d" and one.stamp_ns < begin_ns + S_NS for one in messages)
+    assert f"buddyline/node/d/candidates: {early} topside, {frames} now" in said

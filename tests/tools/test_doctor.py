@@ -112,6 +112,23 @@ def test_hub_and_nodes_on_the_bus_are_judged():
     }
 
 
+def test_each_node_of_a_team_is_judged_by_itself():
+    infos = {node: msgspec.structs.replace(INFO_A, node=node) for node in "abd"}
+    statuses = {node: msgspec.structs.replace(status("hot" if node == "b" else ""), node=node) for node in "abcd"}
+    alive = {*(f"node/{node}" for node in "abcde"), "solver/share/0123"}
+    found = {
+        one.name: one for one in bus.check_bus(bus.Seen(infos=infos, statuses=statuses, alive=alive), "tcp/x", "a")
+    }
+    assert list(found) == ["hub", "node a", "node b", "node c", "node d", "node e"]
+    assert {name: one.level for name, one in found.items() if one.level != "ok"} == {
+        "node b": "problem",
+        "node c": "problem",
+        "node e": "problem",
+    }
+    assert "hot" in found["node b"].text
+    assert "calibration is not known" in found["node c"].text
+
+
 def test_the_bus_is_watched_for_the_given_time():
     network = LocalNetwork()
     with network.connect() as node, network.connect() as doctor:

@@ -40,6 +40,27 @@ def test_the_written_configurations_load_and_name_the_right_identities(spoilt):
     assert load_solver_config(keys / "solver.toml").tls == tls(keys, "solver")
 
 
+def test_each_node_of_a_team_has_an_identity_of_its_own(tmp_path, capsys):
+    keys = make_keys(tmp_path, "a", "b", "c", "tripod_1")
+    assert main(["keys", "--directory", str(keys), "node", "d"]) == 0
+    hub = load_hub_config(str(keys / "hub.toml"))
+    assert hub.nodes == ["a", "b", "c", "d", "tripod_1"]
+    for node in hub.nodes:
+        check_identity(tls(keys, f"node-{node}"), f"node-{node}")
+    with pytest.raises(BuddylineError, match="node-c"):
+        check_identity(tls(keys, "node-d"), "node-c")
+    hub_file = keys / "hub.toml"
+    hub_file.write_text(hub_file.read_text().replace('"c", ', ""))
+    capsys.readouterr()
+    assert main(["keys", "--directory", str(keys), "list"]) == 0
+    lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
+    of_nodes = {name.removeprefix("node-"): line for name, line in lines.items() if name.startswith("node-")}
+    assert sorted(of_nodes) == ["a", "b", "c", "d", "tripod_1"]
+    for node, line in of_nodes.items():
+        assert (f"publishes as node {node}" in line) == (node != "c"), line
+    assert "not admitted" in of_nodes["c"]
+
+
 def test_private_keys_are_private(keys):
     found = {path.name: stat.S_IMODE(path.stat().st_mode) for path in keys.glob("*.key")}
     assert set(found) == {

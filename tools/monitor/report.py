@@ -30,6 +30,7 @@ from buddyline.tools.monitor.coverage import LEGEND, TRACK_LEGEND, clock_words
 from buddyline.tools.monitor.outliers import MAX_LISTED, add_pictures, outliers
 from buddyline.tools.monitor.panel import length_words
 from buddyline.tools.monitor.replay import keyframes, replay_html
+from buddyline.tools.monitor.report_net import net_numbers, net_of, net_sections
 from buddyline.tools.monitor.report_numbers import MIN_STRETCH_S, ReportAbout, numbers_of
 from buddyline.tools.monitor.report_text import budget_html, methods_html, outliers_html
 from buddyline.tools.monitor.summary import Summary, summarize
@@ -79,7 +80,9 @@ def report_html(
     summary = summarize(dive, pair)
     found = outliers(summary.poses, summary.path) if len(summary.path) else None
     add_pictures(dive, (found or [])[:MAX_LISTED])
-    numbers = numbers_of(dive, summary, found, about)
+    net = net_of(dive)
+    of_net = net_numbers(net)
+    numbers = numbers_of(dive, summary, found, about) | {"network": of_net}
     nodes = " and ".join(sorted(summary.picture.nodes)) or "none"
     warnings = [*dive.losses, *authenticity]
     if not summary.poses:
@@ -95,6 +98,7 @@ def report_html(
         _about(about),
         *(f'<p class="warn">{escape(warning)}</p>' for warning in warnings),
         section("Figures", _figures(numbers)),
+        *net_sections(dive, net, of_net),
         section("Methods", methods_html(numbers, summary)),
         section("Where the error of a place comes from", budget_html(numbers)),
         f'<div class="live">{section("Replay", _replay(summary))}</div>',
