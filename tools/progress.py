@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import sys
 import time
 from typing import Final, TextIO
 
 SHOW_AFTER_S: Final = 1.0
 WIDTH: Final = 30
+
+
+def terminal_size() -> os.terminal_size:
+    """Return the size of the terminal that stdout or, where that goes elsewhere, stderr is; COLUMNS and LINES win."""
+    try:
+        of_stderr = os.get_terminal_size(sys.stderr.fileno())
+    except (OSError, ValueError):
+        of_stderr = os.terminal_size((80, 24))
+    return shutil.get_terminal_size(of_stderr)
 
 
 class Progress:

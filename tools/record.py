@@ -7,7 +7,8 @@ import logging
 import shutil
 import sys
 import threading
-from collections import Counter
+import time
+from collections import Counter, deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -19,6 +20,7 @@ from buddyline.tools.authenticity import digest_check, report
 from buddyline.tools.client import client_config
 from buddyline.tools.filling import Filler
 from buddyline.tools.live import LiveClient, follow
+from buddyline.tools.progress import terminal_size
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus
@@ -28,14 +30,24 @@ log = logging.getLogger(__name__)
 
 # What is said at the end; a flood of it must not fill the memory.
 MAX_FOUND: Final = 10_000
-# How often what is recorded is said, on a terminal.
+# How often what is recorded is said, on a terminal, and over how many of these looks rates are measured.
 LOOK_S: Final = 0.5
+RATE_LOOKS: Final = 8
 
 
-def progress_words(total: int, new: int, output: Path) -> str:
-    """Return what has been recorded, how fast (new: since the last look), and what the disk still takes."""
-    free = shutil.disk_usage(output.absolute().parent).free
-    return f"{total} messages, {new / LOOK_S:.0f} a second, {free / 1e9:.1f} GB free"
+def progress_words(then: Counter[str], now: Counter[str], seconds: float, free_bytes: int, width: int) -> str:
+    """Return what has been recorded, what the disk still takes, and each topic's rate: as many as fit into width.
+
+    then, now: messages of each topic, seconds apart.
+    """
+    total = f"{(now.total() - then.total()) / seconds:.0f} a second"
+    words = f"{now.total()} messages, {free_bytes / 1e9:.1f} GB free, {total}"
+    for k, (name, count) in enumerate(now.most_common()):
+        more = f"{', ' if k else ': '}{name} {(count - then[name]) / seconds:.0f}"
+        if len(words + more) >= width:
+            break
+        words += more
+    return words
 
 
 def run(args: argparse.Namespace) -> int:
@@ -51,15 +63,18 @@ def run(args: argparse.Namespace) -> int:
             subscription = follow(bus, EVERYTHING, client.refusals, recording.take, capacity=65536)
             filling = client.spawn("fill", filler.run)
             log.info("record: %s into %s; Ctrl-C ends", client.config.connect, args.output)
-            before = 0
+            looks = deque([(time.monotonic(), recording.counted())], RATE_LOOKS)
             while not client.stop.wait(LOOK_S):
                 if recorder.error is not None:
                     client.fail("recorder", recorder.error)
                 if sys.stderr.isatty():
-                    total = recording.counts.total()
-                    words = progress_words(total, total - before, Path(args.output))
-                    print(f"\r{words}", end="\x1b[K", file=sys.stderr, flush=True)
-                    before = total
+                    looks.append((time.monotonic(), recording.counted()))
+                    (then_s, then), (now_s, now) = looks[0], looks[-1]
+                    free_bytes = shutil.disk_usage(Path(args.output).absolute().parent).free
+                    words = progress_words(then, now, now_s - then_s, free_bytes, terminal_size().columns)
+                    print(f"\r{words}\x1b[K", end="", file=sys.stderr, flush=True)
+            if sys.stderr.isatty():
+                print("\r\x1b[K", end="", file=sys.stderr, flush=True)
             bus.close()
             # The bus has taken its question back.
             filling.join()
@@ -91,6 +106,11 @@ class Recording:
         self._check = digest_check(authority, own=False)
         self._found: list[Discrepancy] = []
         self._lock = threading.Lock()
+
+    def counted(self) -> Counter[str]:
+        """Return how many messages of each topic have been recorded."""
+        with self._lock:
+            return self.counts.copy()
 
     def take(self, envelope: Envelope) -> None:
         """Record a message from the bus."""

@@ -127,6 +127,16 @@ def test_screens_follow_each_other_without_a_line_s_end(monkeypatch):
     assert text.endswith("\x1b[J\n")
 
 
+@pytest.mark.parametrize("no_color", ["", "1"])
+def test_no_color_is_respected(no_color, monkeypatch):
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("NO_COLOR", no_color)
+    assert _show(SimpleNamespace(stop=threading.Event()), running().dashboard, 0.3)
+    assert bool(re.search(r"\x1b\[[0-9;]+m", terminal.getvalue())) == (not no_color)
+
+
 def test_colours_are_left_out_where_nobody_wants_them():
     watch = running()
     plain = watch.dashboard.screen(80, 24, arrows=ASCII_ARROWS)

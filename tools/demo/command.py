@@ -21,6 +21,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.options import above_zero
 from buddyline.protocol.service import Service
 from buddyline.tools.draw.above import ARROWS, ASCII_ARROWS
+from buddyline.tools.progress import terminal_size
 
 if TYPE_CHECKING:
     from buddyline.protocol.messages import Message
@@ -225,7 +226,7 @@ def _show(service: Service, dashboard: Dashboard | TeamDashboard, seconds: float
     arrows = ARROWS if "utf" in (sys.stderr.encoding or "").lower() else ASCII_ARROWS
     over = False
     while not over and not service.stop.wait(0.25 if interactive else 1.0):
-        size = shutil.get_terminal_size()
+        size = terminal_size()
         if interactive:
             text = dashboard.screen(size.columns, size.lines, coloured=coloured, arrows=arrows)
         else:
