@@ -6,9 +6,12 @@ import os
 import shutil
 import subprocess
 import sys
+from importlib.metadata import distribution
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from tests.processes import PATIENCE_S, REPOSITORY
 
@@ -93,3 +96,27 @@ def test_a_pi_sees_the_systems_packages_and_keeps_its_constraints(checkout: Fake
     assert calls[1].endswith("-c node/examples/bookworm.txt -e .[pi]")
     assert checkout.installs("install", "EXTRAS=keys") == ["node/examples/bookworm.txt -e .[keys,pi]"]
     assert (REPOSITORY / "node/examples/bookworm.txt").exists()
+
+
+def test_all_that_the_tests_need_is_pinned() -> None:
+    pins = dict(line.split("==") for line in (REPOSITORY / "constraints.txt").read_text().splitlines() if "==" in line)
+    pinned = {canonicalize_name(name): version for name, version in pins.items()}
+    missing, seen, waiting = set(), set(), [Requirement("buddyline[dev]")]
+    while waiting:
+        wanted = waiting.pop()
+        name = canonicalize_name(wanted.name)
+        if (name, frozenset(wanted.extras)) in seen:
+            continue
+        seen.add((name, frozenset(wanted.extras)))
+        package = distribution(wanted.name)
+        if name != "buddyline" and package.version != pinned.get(name):
+            # Newer or older ones, as `make matrix` tries them, may need others.
+            missing |= set() if name in pinned else {name}
+            continue
+        waiting += [
+            one
+            for one in map(Requirement, package.requires or ())
+            if one.marker is None or any(one.marker.evaluate({"extra": extra}) for extra in (*wanted.extras, ""))
+        ]
+    assert not missing, "constraints.txt leaves these to the day of the installation"
+    assert len(seen) > 40, "the requirements were not followed"
