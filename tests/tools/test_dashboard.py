@@ -197,3 +197,18 @@ def test_what_the_solver_tells_the_divers_is_what_to_do():
     watch = running()
     watch.take(solver_status(at(31), advice=["turn b 20 deg left", "come 1.5 m closer"]))
     assert "; turn b 20 deg left, come 1.5 m closer" in watch.dashboard.screen(200, 60)
+
+
+def test_a_machine_that_is_too_slow_is_named_and_none_that_is_not() -> None:
+    for every, unmatched, share in ((1, False, 1.0), (2, False, 16 / 31), (1, True, 21 / 31)):
+        watch = WatchedPair()
+        for k in range(0, 31, every):
+            refused = rejection(k, reason="unmatched" if unmatched else "ambiguous")
+            watch.take(refused if k % 3 == 1 else pose(k, **estimate(k)))
+        summary = watch.dashboard.summary({})
+        assert summary["pictured_share"] == pytest.approx(share)
+        assert ("this machine is busy" in summary_text(summary)) == (share < 0.9)
+    watch = WatchedPair()
+    for k in (0, 20):
+        watch.take(rejection(k, reason="unmatched"))
+    assert "both pictures came for 0% of the triggers" in summary_text(watch.dashboard.summary({}))

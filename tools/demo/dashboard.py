@@ -46,6 +46,8 @@ RECENT_S: Final = 5.0
 # Interval at which the track is kept for the figures of the whole run; its errors change more slowly.
 TRACK_SPACING_NS: Final = S_NS // 5
 SHARE_SAMPLES: Final = 500
+# Share of triggers with pictures of both nodes; a machine that renders fast enough has nearly all.
+ENOUGH_PICTURES: Final = 0.9
 # The view from above, and from which height of the terminal on the health of all is shown as well.
 LEAST_MAP_ROWS, MAP_ROWS, MAP_COLUMNS, MORE_ROWS = 4, 16, 72, 18
 CYAN, MAGENTA, YELLOW, PLAIN = "\x1b[36m", "\x1b[35m", "\x1b[33m", "\x1b[0m"
@@ -80,6 +82,8 @@ class Dashboard:
         # Triggers with all four lights in view, and those of them with a pose.
         self._in_view, self._solved_in_view = 0, 0
         self._last_rejected: Rejected | None = None
+        # The first and the newest trigger that was answered.
+        self._first_trigger, self._newest_trigger = math.inf, -math.inf
         self._nodes: dict[str, NodeStatus] = {}
         self._solver: SolverStatus | None = None
 
@@ -93,6 +97,9 @@ class Dashboard:
         """Take one message off the bus."""
         message = envelope.message
         with self._lock:
+            if isinstance(message, RelativePose | Rejected):
+                self._first_trigger = min(self._first_trigger, message.trigger)
+                self._newest_trigger = max(self._newest_trigger, message.trigger)
             if isinstance(message, RelativePose):
                 self._poses.append(message)
                 self._truths.append(self._world.truth(message.stamp_ns, message.trigger))
@@ -220,6 +227,13 @@ class Dashboard:
         total = len(self._poses) + sum(self._rejected.values())
         return len(self._poses) / total if total else None
 
+    def _pictured_share(self) -> float | None:
+        """Return the share of triggers of which both nodes' pictures came, from the first answer on."""
+        total = len(self._poses) + sum(self._rejected.values())
+        if not total:
+            return None
+        return (total - self._rejected["unmatched"]) / (self._newest_trigger - self._first_trigger + 1)
+
     def _off(self, shown: Estimate) -> tuple[float, float, float]:
         """Return how far an estimate is off, m, its range's error, m, and how far it is turned, deg."""
         true = TruthTrack([self._world.truth(shown.stamp_ns, 0)]).interpolated(shown.stamp_ns)
@@ -282,6 +296,7 @@ class Dashboard:
                 "rejected": dict(self._rejected),
                 "solved_share": self._solved_share(),
                 "solved_share_in_view": self._solved_share_in_view(),
+                "pictured_share": self._pictured_share(),
                 "wrong_poses": int(errors.wrong.sum()),
                 "tracks": {
                     figures.mode: {
@@ -317,8 +332,11 @@ def overwritten(lines: Iterable[str]) -> str:
 
 def summary_text(summary: dict[str, Any]) -> str:
     """Return the figures of a whole run for a person."""
+    slow = _slow_words(summary["pictured_share"])
     if not summary["poses"]:
-        return f"no pose in {summary['seconds']:.0f} s; rejected: {summary['rejected'] or 'nothing'}"
+        return "\n".join(
+            [f"no pose in {summary['seconds']:.0f} s; rejected: {summary['rejected'] or 'nothing'}", *slow]
+        )
     rejected = ", ".join(f"{reason} {count}" for reason, count in summary["rejected"].items()) or "none"
     cpu = ", ".join(f"{name} {used:.0%}" for name, used in summary["cpu_share"].items())
     share = summary["solved_share_in_view"]
@@ -333,8 +351,17 @@ def summary_text(summary: dict[str, Any]) -> str:
         *(_track_words(mode, track) for mode, track in summary["tracks"].items() if track["samples"]),
         f"exposure to pose: median {summary['latency_ms']:.0f} ms, p99 {summary['latency_p99_ms']:.0f} ms",
         f"processor: {cpu}",
+        *slow,
     ]
     return "\n".join(lines)
+
+
+def _slow_words(share: float | None) -> list[str]:
+    """Return a line where too few triggers had both pictures."""
+    if share is None or share >= ENOUGH_PICTURES:
+        return []
+    said = f"both pictures came for {share:.0%} of the triggers: this machine is busy, or too slow for the demo"
+    return [f"{said}; --rate 4 takes fewer"]
 
 
 def _track_words(mode: str, track: dict[str, Any]) -> str:
