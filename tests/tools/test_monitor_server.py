@@ -21,12 +21,13 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Message, NodePose
 from buddyline.protocol.topics import key_of
 from buddyline.tools.monitor.coverage import Coverage
-from buddyline.tools.monitor.frames import Viewer, fields
+from buddyline.tools.monitor.frames import Contents, Viewer, fields, scene
 from buddyline.tools.monitor.live import LiveSession
 from buddyline.tools.monitor.overview import Overview
 from buddyline.tools.monitor.playback import Playback, cover
 from buddyline.tools.monitor.server import FILES, PageServer, open_listener
 from buddyline.tools.monitor.view import DiveSession
+from buddyline.tools.pairs import Pair
 
 from tests.processes import REPOSITORY
 from tests.tools.evaluated import INFOS, RIGHT, info, pose, rejection, track, write_log
@@ -194,6 +195,40 @@ class TestFrames:
             health = frame.get("health", health)
             if (banner := frame.get("banner")) is not None:
                 assert (banner["level"] == "ok") == ("All is well" in health), (step, banner)
+
+    def test_what_is_shown_at_an_instant_is_made_once_for_all_who_look(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        overview, contents = filled(), dict[Pair | None, Contents]()
+        made: list[int] = []
+        monkeypatch.setattr("buddyline.tools.monitor.frames.scene", lambda *args: made.append(args[-1]) or scene(*args))
+        viewers = [Viewer(live=True, contents=contents) for _ in range(5)]
+        # Each is told all at first, and each makes all anew.
+        first = [viewer.frame(overview, at(29)) for viewer in viewers]
+        assert all(set(frame) == set(first[0]) >= {"scene", "banner", "health", "points"} for frame in first)
+        made.clear()
+        for step in range(1, 31):
+            frames = [viewer.frame(overview, at(29) + step * 33_333_333) for viewer in viewers]
+            assert all(frame == frames[0] for frame in frames)
+        assert len(made) == 30
+
+    def test_a_chosen_pair_that_comes_later_is_told_from_its_start(self) -> None:
+        overview, viewer = filled(), Viewer(live=True)
+        viewer.pair = "a", "c"
+        assert len(viewer.frame(overview, at(29))["points"]) == 15
+        take(overview, pose(30, (0.0, 0.0, 7.0), node_b="c"), at(30))
+        frame = viewer.frame(overview, at(30))
+        assert frame["reset"] is True
+        assert [point[0] for point in frame["points"]] == [at(30) / 1e6]
+        assert frame["pairs"]["shown"] == ["a", "c"]
+
+    def test_who_comes_later_is_told_nothing_old(self) -> None:
+        overview, contents = filled(), dict[Pair | None, Contents]()
+        left = Viewer(live=True, contents=contents)
+        assert left.frame(overview, at(29))["banner"]["level"] == "ok"
+        left.frame(overview, at(29) + 33_333_333)
+        frame = Viewer(live=True, contents=contents).frame(overview, at(29) + 60 * S_NS)
+        assert frame["banner"]["level"] == "problem"
+        assert "All is well" not in frame["health"]
+        assert "STALE" in frame["cameras"][0]
 
     def test_all_nodes_that_a_sees_are_in_the_scene(self) -> None:
         overview = filled()

@@ -40,15 +40,59 @@ FRUSTUM_M: Final = 0.35
 Row = list[float | int | None]
 
 
-class Viewer:
-    """What one viewer has been told, and what he has chosen: a pair, and fields to plot."""
+class Contents:
+    """What is shown of a pair beside trail and plots: made once at an instant, for all who look at it then."""
 
     def __init__(self, *, live: bool) -> None:
+        self.parts: dict[str, Any] = {}
+        self._live = live
+        self._now_ns = -1
+        self._tick = 0
+
+    def update(self, overview: Overview, picture: PairPicture, now_ns: int, *, anew: bool) -> None:
+        """Go on to an instant, if it is another one. anew: make the texts too, although they are not yet due."""
+        if now_ns == self._now_ns and not anew:
+            return
+        self._now_ns = now_ns
+        self._tick = 0 if anew else self._tick + 1
+        self._make("scene", scene(overview, picture, now_ns))
+        texts = self._tick % TEXTS_EVERY == 0
+        if self._tick % BANNER_EVERY == 0:
+            first = findings(picture, now_ns, live=self._live)[0]
+            # Deck mode has no other sign that this is not now.
+            text = f"{'' if self._live else 'Stored dive. '}{sentence(first, now_ns)}"
+            banner = {"level": first.level, "text": text, "advice": first.advice}
+            # Below a banner that is green no longer nothing else may say that all is well.
+            texts |= self.parts.get("banner", banner)["level"] != first.level
+            self._make("banner", banner)
+        if texts:
+            self._make("figures", panel.figures(picture, now_ns))
+            self._make("health", panel.health(picture, now_ns, live=self._live))
+            ends = picture.end_nodes()
+            self._make("cameras", [panel.camera(picture, node, now_ns) if node else "" for node in ends])
+            self._make("rigs", {name: rig_outline(node.info) for name, node in picture.nodes.items()})
+            shown = [name or "" for name in picture.ends()]
+            self._make("pairs", {"all": ["/".join(pair) for pair in overview.pairs()], "shown": shown})
+
+    def _make(self, name: str, part: Any) -> None:
+        """Take a part; one that says the same as before stays the same object, which needs not be told again."""
+        if self.parts.get(name) != part:
+            self.parts[name] = part
+
+
+class Viewer:
+    """What one viewer has been told, and what he has chosen: a pair, and fields to plot.
+
+    contents: by pair, of all who look at the same overview; None: of this viewer alone.
+    """
+
+    def __init__(self, *, live: bool, contents: dict[Pair | None, Contents] | None = None) -> None:
         self.pair: Pair | None = None
         # The time of the last value told, by chosen field (`key field`).
         self._probed_ns: dict[str, int] = {}
         self._live = live
-        self._tick = 0
+        self._contents = {} if contents is None else contents
+        self._shown: Pair | None = None
         self._told: dict[str, Any] = {}
         self._point_ns = self._miss_ns = -1
         self._reset = True
@@ -58,7 +102,6 @@ class Viewer:
         self._told.clear()
         self._point_ns = self._miss_ns = -1
         self._probed_ns = dict.fromkeys(self._probed_ns, -1)
-        self._tick = 0
         self._reset = True
 
     def choose_fields(self, names: list[str]) -> None:
@@ -68,37 +111,22 @@ class Viewer:
     def frame(self, overview: Overview, now_ns: int) -> dict[str, Any]:
         """Return what is new for this viewer."""
         picture = overview.picture(self.pair)
-        said: dict[str, Any] = {"now": now_ns / MS_NS, "scene": scene(overview, picture, now_ns)}
+        if picture.pair != self._shown:
+            self._shown = picture.pair
+            self.restart()
+        contents = self._contents.setdefault(picture.pair, Contents(live=self._live))
+        contents.update(overview, picture, now_ns, anew=self._reset)
+        said: dict[str, Any] = {"now": now_ns / MS_NS}
         if self._reset:
             said["reset"] = True
             self._reset = False
+        said |= {name: part for name, part in contents.parts.items() if self._told.get(name) is not part}
+        self._told |= contents.parts
         said |= self._new_points(picture)
-        texts = self._tick % TEXTS_EVERY == 0
-        if self._tick % BANNER_EVERY == 0:
-            first = findings(picture, now_ns, live=self._live)[0]
-            # Deck mode has no other sign that this is not now.
-            text = f"{'' if self._live else 'Stored dive. '}{sentence(first, now_ns)}"
-            banner = {"level": first.level, "text": text, "advice": first.advice}
-            # Below a banner that is green no longer nothing else may say that all is well.
-            texts |= self._told.get("banner", banner)["level"] != first.level
-            self._tell(said, "banner", banner)
-        if texts:
-            self._tell(said, "figures", panel.figures(picture, now_ns))
-            self._tell(said, "health", panel.health(picture, now_ns, live=self._live))
-            ends = picture.end_nodes()
-            self._tell(said, "cameras", [panel.camera(picture, node, now_ns) if node else "" for node in ends])
-            self._tell(said, "rigs", {name: rig_outline(node.info) for name, node in picture.nodes.items()})
-            shown = [name or "" for name in picture.ends()]
-            self._tell(said, "pairs", {"all": ["/".join(pair) for pair in overview.pairs()], "shown": shown})
         probes = self._probes(overview)
         if probes:
             said["probes"] = probes
-        self._tick += 1
         return said
-
-    def _tell(self, said: dict[str, Any], name: str, content: Any) -> None:
-        if self._told.get(name) != content:
-            self._told[name] = said[name] = content
 
     def _new_points(self, picture: PairPicture) -> dict[str, Any]:
         points: list[Row] = []

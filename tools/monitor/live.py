@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 
 DEFAULT_HOST: Final = "127.0.0.1"
 DEFAULT_PORT: Final = 8080
+# Half of the time between two frames.
+TOGETHER_NS: Final = 16_000_000
 STATES: Final = (topics.INFO, topics.NODE_STATUS, topics.SOLVER_STATUS)
 STREAMS: Final = (
     *(topics.POSE, topics.TRACK, topics.REJECTED, topics.NET_POSE),
@@ -89,10 +91,14 @@ class LiveSession:
         self.lock = threading.Lock()
         self._overview = overview
         self._clock = clock
+        self._now_ns = 0
 
     def step(self, commands: list[dict[str, Any]]) -> tuple[Overview, int, bool]:
-        """Return what is watched, now."""
-        return self._overview, self._clock.now_ns(), False
+        """Return what is watched, now. Those who ask together get the same instant."""
+        now_ns = self._clock.now_ns()
+        if not 0 <= now_ns - self._now_ns < TOGETHER_NS:
+            self._now_ns = now_ns
+        return self._overview, self._now_ns, False
 
     def playback(self) -> None:
         """Return None: nothing is played."""

@@ -25,10 +25,11 @@ from urllib.parse import parse_qs, urlsplit
 import msgspec
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.extras import needed
-from buddyline.tools.monitor.frames import RATE_HZ, Viewer, fields
+from buddyline.tools.monitor.frames import RATE_HZ, Contents, Viewer, fields
 
 if TYPE_CHECKING:
     from buddyline.tools.monitor.overview import Overview
+    from buddyline.tools.pairs import Pair
     from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
 
@@ -143,6 +144,8 @@ class _Serving:
     def __init__(self, server: PageServer) -> None:
         self._server = server
         self._viewers = 0
+        # Of running nodes, at which all look together.
+        self._contents: dict[Pair | None, Contents] = {}
         self._packed: dict[str, tuple[bytes, bytes, str]] = {}
         files = resources.files("buddyline.tools.monitor") / "web"
         for path, (name, kind) in FILES.items():
@@ -227,10 +230,10 @@ class _Serving:
 
     async def _tell(self, connection: ServerConnection, commands: list[dict[str, Any]]) -> None:
         server = self._server
-        session, viewer = await asyncio.to_thread(server.open_session), Viewer(live=server.live)
+        session = await asyncio.to_thread(server.open_session)
+        viewer = Viewer(live=server.live, contents=self._contents if server.live else None)
         try:
             await connection.send(msgspec.json.encode({"title": server.title, "live": server.live}).decode())
-            due_s = time.monotonic()
             while True:
                 taken, commands[:] = list(commands), []
                 if server.live:
@@ -239,9 +242,9 @@ class _Serving:
                 else:
                     frame = await asyncio.to_thread(self._frame, session, viewer, taken)
                 await connection.send(frame, text=True)
-                # A slow viewer gets fewer frames, never old ones.
-                due_s = max(due_s + TICK_S, time.monotonic())
-                await asyncio.sleep(due_s - time.monotonic())
+                # All viewers get their frames together, which wakes this thread once. A slow one gets fewer of them,
+                # never old ones.
+                await asyncio.sleep(TICK_S - time.monotonic() % TICK_S)
         finally:
             session.close()
 
@@ -252,9 +255,7 @@ class _Serving:
             for command in commands:
                 if "pair" in command:
                     ids = tuple(str(command["pair"]).split("/"))
-                    pair = (ids[0], ids[1]) if len(ids) == 2 else None
-                    if pair != viewer.pair:
-                        viewer.pair, jumped = pair, True
+                    viewer.pair = (ids[0], ids[1]) if len(ids) == 2 else None
                 if isinstance(command.get("probe"), list):
                     viewer.choose_fields([str(name) for name in command["probe"]])
                 if "fields" in command:
