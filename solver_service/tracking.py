@@ -209,8 +209,9 @@ class PairTracker:
             self._posed |= isinstance(one, RelativePose)
             if isinstance(one, Rejected) and not self._posed:
                 apart = one.detail == LOOK_APART
-                # One in LOOKS triggers is solved also of nodes that look apart.
-                self._rests = apart or (self._rests and one.trigger % LOOKS == 0)
+                # One in LOOKS triggers is solved also of nodes that look apart; one of a single frame tells nothing.
+                untold = one.trigger % LOOKS == 0 or one.reason == "unmatched"
+                self._rests = apart or (self._rests and untold)
                 if self._rests:
                     self._unseen[one.trigger] = one.stamp_ns
         if self._filter is not None:

@@ -187,19 +187,19 @@ class TrackPool(TrackSteps):
         """Follow each candidate of the node that has not yet told anything as each light, as estimates of their own."""
         if len(self.challengers) > 3 * MAX_TENTATIVE:
             return
-        base = estimate.copied(unseen_by=None)
-        self._step(base, t_s, None)
-        _, y, H = self._compared(sight, base.state, base.rates_radps, sight.t_s - base.t_s)
+        self._step(estimate, t_s, None)
+        state, rates_radps, P = estimate.state, estimate.rates_radps, estimate.covariance[BLOCK]
+        _, y, H = self._compared(sight, state, rates_radps, sight.t_s - estimate.t_s)
         log_clutter = math.log(sight.clutter / self.nodes[sight.node].rig.camera.area_px2)
         for k in range(len(y)):
             for light in (0, 1):
                 if not np.isfinite(y[k, light]).all():
                     continue
-                S = H[k, light] @ base.covariance[BLOCK] @ H[k, light].T + sight.sigma_px[k] ** 2 * np.eye(2)
+                S = H[k, light] @ P @ H[k, light].T + sight.sigma_px[k] ** 2 * np.eye(2)
                 chi2 = float(y[k, light] @ np.linalg.solve(S, y[k, light]))
                 if chi2 > 12.0:
                     continue
-                child = base.copied()
+                child = estimate.copied(unseen_by=None)
                 spread = float(np.linalg.det(S))
                 if spread <= 0.0:
                     raise ArithmeticError("a light's place without a covariance")

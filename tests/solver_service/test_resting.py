@@ -22,6 +22,8 @@ from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.fix import NoFix
 from buddyline.solver_service.geometry.observation import Sensed
 from buddyline.solver_service.resting import CROWD, LOOK_APART, LOOKS, NOT_IN_VIEW, REST_NS, Resting, look_apart
+from buddyline.solver_service.track.filter import TrackFilter
+from buddyline.solver_service.tracking import TrackSettings
 from msgspec.structs import replace
 
 from tests.solver_service.scenes import IDEAL
@@ -114,6 +116,21 @@ def test_a_team_solves_pairs_that_look_apart_once_in_five_triggers(three: list[M
     resting = [trigger for (a, b, trigger), why in told.items() if (a, b) == ("a", "c") and why == LOOK_APART]
     assert all(trigger % LOOKS for trigger in resting)
     assert min(resting) * PLAN.period_ns > START_NS + REST_NS
+
+
+def test_pictures_of_nodes_that_look_apart_start_no_track(
+    three: list[Message], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the other node's picture of a trigger is lost."""
+    lost = [one for one in three if isinstance(one, Candidates) and one.node == "c" and one.trigger % LOOKS == 1]
+    fed: list[tuple[str, int]] = []
+    monkeypatch.setattr(TrackFilter, "add_frame", lambda self, _, frame: fed.append((self.both, frame.stamp_ns)))
+    solver = SolverCore(SolveConfig().settings("test"), track=TrackSettings(frozenset({"filter"})))
+    solver.handle_many([one for one in three if one not in lost])
+    solver.flush()
+    resting_ns = START_NS + REST_NS + S_NS
+    assert sum(both == "nodes a and b" and stamp_ns > resting_ns for both, stamp_ns in fed) > 30
+    assert [stamp_ns for both, stamp_ns in fed if both == "nodes a and c" and stamp_ns > resting_ns] == []
 
 
 def in_ring(node: int, t_s: float) -> Placement:
