@@ -175,6 +175,12 @@ def test_a_sparse_inverse_is_the_dense_one(monkeypatch):
         np.testing.assert_allclose(sparse.positions[name].position_m, position.position_m, atol=1e-7)
         np.testing.assert_allclose(sparse.positions[name].covariance, position.covariance, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(sparse.solution.redundancies, dense.solution.redundancies, atol=1e-7)
+    some = np.array([0, 1, 2, 40, 7, 41, len(dense.solution.x) - 1])
+    expected = dense.solution.normal.inverse(some)
+    np.testing.assert_allclose(
+        expected, dense.solution.normal.solve(np.eye(len(dense.solution.x))[:, some])[some], rtol=1e-6, atol=1e-15
+    )
+    np.testing.assert_allclose(sparse.solution.normal.inverse(some), expected, rtol=1e-6, atol=1e-15)
     # The trace of I - A N^-1 A^T W.
     assert dense.solution.redundancies.sum() == pytest.approx(dense.solution.freedom, rel=1e-6)
 

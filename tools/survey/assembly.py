@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from statistics import median
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 from buddyline.protocol.clock import S_NS
 from buddyline.tools.survey.averages import Floats, wrap
@@ -68,8 +68,7 @@ class Assembly:
     turns_rad: Sequence[float]
 
 
-@dataclass(frozen=True, slots=True)
-class DepthReading:
+class DepthReading(NamedTuple):
     """A gauge's depth at a leg's end (0, 1), m: its noise, and its slow error (1 sd).
 
     station: as the leg names it. gauge: its dive and node. time_s: of the leg's middle, since that of the dive's first.
@@ -321,18 +320,23 @@ class _Compasses:
                 if sigma_deg is not UNSET:
                     sigmas[leg.dive, node].append(math.radians(sigma_deg))
         self._sigma = {key: median(values) for key, values in sigmas.items()}
+        # By dive and node: zero, iron ahead and iron abeam.
+        self._columns: dict[tuple[int, str], tuple[int, int, int]] = {}
 
     def _terms(self, leg: Leg, node: str, heading: float) -> list[tuple[int, float]]:
-        name, sigma = compass_name(leg.dive, node), self._sigma[leg.dive, node]
-        of, iron = self._of, math.sqrt(IRON_SHARE) * sigma
         common = math.radians(self._project.settings.compass_common_deg)
-        north = [(of.unknown(NORTH, common), 1.0)] if common else []
-        return [
-            *north,
-            (of.unknown(f"{name}: zero", math.sqrt(ZERO_SHARE) * sigma), 1.0),
-            (of.unknown(f"{name}: iron ahead", iron), math.cos(heading)),
-            (of.unknown(f"{name}: iron abeam", iron), math.sin(heading)),
-        ]
+        north = [(self._of.unknown(NORTH, common), 1.0)] if common else []
+        zero, ahead, abeam = self._columns.get((leg.dive, node)) or self._unknowns(leg.dive, node)
+        return [*north, (zero, 1.0), (ahead, math.cos(heading)), (abeam, math.sin(heading))]
+
+    def _unknowns(self, dive: int, node: str) -> tuple[int, int, int]:
+        of, name, sigma = self._of, compass_name(dive, node), self._sigma[dive, node]
+        self._columns[dive, node] = found = (
+            of.unknown(f"{name}: zero", math.sqrt(ZERO_SHARE) * sigma),
+            of.unknown(f"{name}: iron ahead", math.sqrt(IRON_SHARE) * sigma),
+            of.unknown(f"{name}: iron abeam", math.sqrt(IRON_SHARE) * sigma),
+        )
+        return found
 
     def carry(self, to: Assembly, number: int, start: int, end: int) -> int:
         """Add the unknown azimuth of a leg's line from camera to camera; return its column."""

@@ -134,12 +134,14 @@ class Survey:
         """Find first places of all stations by the shortest way of legs; leave out legs that hang on nothing."""
         project, grid, at = self.project, self.grid, self.first_m
         self.turns_rad = [grid.leg_turn_rad(leg, leg_date(project, leg), at.get(leg.from_)) for leg in self.legs]
-        self.first_m, why, self.north_along = place_all(project, self.legs, ends, self.turns_rad, self._starts())
+        self.steps = list(map(step_m_of, self.legs, self.turns_rad))
+        self.first_m, why, self.north_along = place_all(project, self.legs, ends, self.steps, self._starts())
         self.left_out += [(leg, said) for leg, said in zip(self.legs, why, strict=True) if said]
         kept = [number for number, said in enumerate(why) if not said]
         self.legs = [self.legs[number] for number in kept]
         self.ends = [ends[number] for number in kept]
         self.turns_rad = [self.turns_rad[number] for number in kept]
+        self.steps = [self.steps[number] for number in kept]
 
     def _starts(self) -> dict[str, Floats]:
         return {name: np.where(np.isnan(p), self._altitude_m(name), p) for name, (p, _) in self.fixed.items()}
@@ -160,11 +162,12 @@ class Survey:
     def adjust(self, change: Change | None = None, *, linear: bool = False) -> Solution:
         """Return the least squares solution, with other names and without the observations that a change drops."""
         change = change or Change()
-        legs, ends, first_m = self.legs, self.ends, self.first_m
+        steps, ends, first_m = self.steps, self.ends, self.first_m
         if change.names or change.drops:
-            ends = [(self.name_at(n, 0, change), self.name_at(n, 1, change)) for n in range(len(legs))]
-            legs = [_without(leg, number, change.drops) for number, leg in enumerate(legs)]
-            first_m = place_all(self.project, legs, ends, self.turns_rad, self._starts())[0]
+            ends = [(self.name_at(n, 0, change), self.name_at(n, 1, change)) for n in range(len(self.legs))]
+            legs = [_without(leg, number, change.drops) for number, leg in enumerate(self.legs)]
+            steps = list(map(step_m_of, legs, self.turns_rad))
+            first_m = place_all(self.project, legs, ends, steps, self._starts())[0]
         names = list(dict.fromkeys([*(name for name in self.fixed if name in first_m), *(n for e in ends for n in e)]))
         if not set(names) <= set(first_m):
             # Without the observation a station hangs on nothing; as before it is a place to begin with.
@@ -181,7 +184,6 @@ class Survey:
             self.origin_m,
             self.north_along,
         )
-        steps = [step_m_of(leg, turn_rad) for leg, turn_rad in zip(legs, self.turns_rad, strict=True)]
         of.vectors_m = np.array([NOWHERE if step_m is None else step_m for step_m in steps]).reshape(-1, 3)
         for row, key in enumerate(zip(of.leg, of.what, strict=True) if change.drops else ()):
             if key in change.drops:

@@ -210,28 +210,34 @@ def line_of(leg: Leg, measures: Measures | None, turn_rad: float) -> Line | None
         run_m = math.sqrt(distance_m**2 - up_m**2)
         tilt = up_m / run_m
         run_var = (distance_m / run_m * distance_sigma_m) ** 2 + tilt**2 * rise_var
-        covariance = np.array([[run_var, -tilt * rise_var], [-tilt * rise_var, rise_var]])
+        covariance = [[run_var, -tilt * rise_var], [-tilt * rise_var, rise_var]]
     else:
         return None
     east, north = math.sin(azimuth), math.cos(azimuth)
-    # Columns: by run, by rise, by azimuth.
-    jacobian = np.array([[east, 0.0, run_m * north], [north, 0.0, -run_m * east], [0.0, 1.0, 0.0]])
-    parts = np.zeros((3, 3))
-    parts[:2, :2], parts[2, 2] = covariance, azimuth_sigma**2
+    # Of run, rise, and aside.
+    (run_var, shared), (_, rise_var) = covariance
+    aside_var = (run_m * azimuth_sigma) ** 2
+    between = east * north * (run_var - aside_var)
     return Line(
         leg=leg,
         measures=measures,
         vector_m=np.array([run_m * east, run_m * north, up_m]),
-        covariance=jacobian @ parts @ jacobian.T,
+        covariance=np.array(
+            [
+                [east**2 * run_var + north**2 * aside_var, between, east * shared],
+                [between, north**2 * run_var + east**2 * aside_var, north * shared],
+                [east * shared, north * shared, rise_var],
+            ]
+        ),
         rise_m=up_m,
-        rise_sigma_m=math.sqrt(covariance[1, 1]),
-        run_sigma_m=math.sqrt(covariance[0, 0]),
+        rise_sigma_m=math.sqrt(rise_var),
+        run_sigma_m=math.sqrt(run_var),
         by_clino=bool(slopes),
         turn_rad=turn_rad,
     )
 
 
-def _sloped(measures: Measures) -> tuple[tuple[float, float], Floats]:
+def _sloped(measures: Measures) -> tuple[tuple[float, float], list[list[float]]]:
     """Return run and rise by least squares of distance, inclinations and rise, and their covariance (2, 2)."""
     distance_m, distance_sigma_m = measures.distance
     slope = sum(angle for angle, _ in measures.slopes) / len(measures.slopes)
@@ -248,7 +254,7 @@ def _sloped(measures: Measures) -> tuple[tuple[float, float], Floats]:
         covariance = np.linalg.inv(A.T @ A)
         sloped = sloped + covariance @ (A.T @ (table[:, 2] / table[:, 3]))
     run_m, up_m = sloped.tolist()
-    return (run_m, up_m), covariance
+    return (run_m, up_m), covariance.tolist()
 
 
 def _hypot(*sigmas: float | UnsetType) -> float:

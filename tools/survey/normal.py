@@ -70,6 +70,33 @@ class Normal:
         tree = self._tree
         return np.asarray(scale * self._lu.solve(np.ascontiguousarray(scaled[tree.order]))[tree.place])
 
+    def inverse(self, unknowns: Ints) -> Floats:
+        """Return the inverse between some unknowns, (u, u).
+
+        With N = L D L^T, it is Y^T D^-1 Y of Y = L^-1 I; a column of Y has the unknown's ancestors in the elimination
+        tree alone (Gilbert 1994), so that few unknowns touch little of L.
+        """
+        scale = self._scale[unknowns]
+        if self._tree is None:
+            between = np.linalg.inv(self._dense)[np.ix_(unknowns, unknowns)]
+        else:
+            from scipy.sparse.linalg import splu
+
+            lower, here = self._lu.L, self._lu.perm_c[self._tree.place[unknowns]]
+            lower.sort_indices()
+            below = np.minimum(lower.indptr[:-1] + 1, lower.nnz - 1)
+            parents = np.where(np.diff(lower.indptr) > 1, lower.indices[below], -1)
+            above, kept = np.unique(here), np.zeros(self.count, dtype=bool)
+            while len(above):
+                kept[above] = True
+                above = np.unique(parents[above])
+                above = above[(above >= 0) & ~kept[above]]
+            every = np.flatnonzero(kept)
+            units = (every[:, None] == here).astype(float)
+            Y = splu(lower[every][:, every], permc_spec="NATURAL", **SYMMETRIC).solve(units)
+            between = Y.T @ (Y / self._lu.U.diagonal()[every, None])
+        return np.asarray(scale[:, None] * between * scale)
+
     def blocks(self, groups: Ints, columns: Ints, values: Floats) -> tuple[Floats, Floats]:
         """Return the inverse between the unknowns of each group, (g, k, k), and v^T N^-1 v of each row v, (m,).
 

@@ -22,14 +22,14 @@ def place_all(
     project: Project,
     legs: Sequence[Leg],
     ends: Sequence[tuple[str, str]],
-    turns_rad: Sequence[float],
+    steps: Sequence[Floats | None],
     fixed: dict[str, Floats],
 ) -> tuple[dict[str, Floats], list[str], tuple[str, str] | None]:
     """Return places of stations (east, north, up, m), why a leg has none ("": it has), and the line that gives north.
 
-    fixed: places to begin with. The last is None where directions were read; else north is arbitrary: along that line.
+    steps: the legs' vectors, see step_m_of. fixed: places to begin with. The last is None where directions were read;
+    else north is arbitrary: along that line.
     """
-    steps = [step_m_of(leg, turn_rad) for leg, turn_rad in zip(legs, turns_rad, strict=True)]
     touching: dict[str, list[tuple[str, Floats]]] = {}
     ranges: dict[str, list[tuple[str, float, float]]] = {}
     for leg, (start, end), step_m in zip(legs, ends, steps, strict=True):

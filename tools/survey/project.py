@@ -278,6 +278,8 @@ class Project(Config, frozen=True, kw_only=True):
 
     def edit_of(self, leg: Leg) -> Edit | None:
         """Return a person's decision on this repeat of a leg, or on the leg."""
+        if not self.edit:
+            return None
         found = [edit for edit in self.edit if edit.leg == leg.name and edit.start_ns in (UNSET, leg.start_ns)]
         return max(found, key=lambda edit: edit.start_ns is not UNSET, default=None)
 

@@ -72,15 +72,12 @@ def proposals(solution: Solution, lines: Sequence[tuple[str, str]]) -> list[Prop
         and not any(beside[one] & beside[j] for one in beside[i])
     ]
     pairs = sorted(pairs)[:MOST_PAIRS]
-    # Of the difference of two places: so many right sides are solved at once.
-    apart = np.zeros((len(solution.x), 3 * len(pairs)))
+    near = np.array([(i, j) for _, i, j in pairs], dtype=np.int64).reshape(-1, 2)
+    unknowns = 3 * number[near].reshape(-1, 2, 1) + np.arange(3)
+    Z = solution.normal.inverse(unknowns.ravel()).reshape(len(pairs), 2, 3, len(pairs), 2, 3)
     for k, (_, i, j) in enumerate(pairs):
-        for axis in range(3):
-            apart[3 * number[i] + axis, 3 * k + axis], apart[3 * number[j] + axis, 3 * k + axis] = 1.0, -1.0
-    solved = solution.normal.solve(apart) if pairs else apart
-    for k, (_, i, j) in enumerate(pairs):
-        part = slice(3 * k, 3 * k + 3)
-        C = solved[3 * number[i] : 3 * number[i] + 3, part] - solved[3 * number[j] : 3 * number[j] + 3, part]
+        own, shared = Z[k, :, :, k], Z[k, 0, :, k, 1]
+        C = own[0, :, 0] + own[1, :, 1] - shared - shared.T
         d = P[i] - P[j]
         flat = C[:2, :2] + 2 * HELD_M**2 * np.eye(2)
         chi2 = float(d[:2] @ np.linalg.solve(flat, d[:2]))
