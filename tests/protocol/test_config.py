@@ -1,8 +1,10 @@
 """Configuration: strict, and errors name file, field and value."""
 
+from datetime import datetime
+
 import pytest
 from buddyline.node.config import NodeConfig
-from buddyline.protocol.config import ConfigError, config_sha256, load_config, parse_config
+from buddyline.protocol.config import LONG, Config, ConfigError, config_sha256, load_config, parse_config
 
 
 @pytest.mark.parametrize(
@@ -22,6 +24,27 @@ def test_errors_name_field_and_value(text, says):
         parse_config(text, NodeConfig, "a.toml")
     for word in ["a.toml", *says]:
         assert word in str(refused.value)
+
+
+class Times(Config, frozen=True, kw_only=True):
+    time: list[datetime]
+    text: str
+
+
+def test_a_long_text_is_read_as_a_short_one(monkeypatch):
+    rtoml = pytest.importorskip("rtoml")
+    text = 'time = [2026-05-01T10:20:30Z, 2026-05-01T10:20:30.5+02:00]\ntext = """\nm\\u00e9tre\n"""\n'
+    short = parse_config(text, Times, "a.toml")
+    assert short.text == "m\u00e9tre\n"
+    assert parse_config(text + "#" * LONG, Times, "a.toml") == short
+    refused = []
+    for end in ("", "#" * LONG):
+        with pytest.raises(ConfigError, match=r"a\.toml: not TOML: .* line 5, column") as error:
+            parse_config(text + "text = 2\n" + end, Times, "a.toml")
+        refused.append(str(error.value))
+    assert refused[0] == refused[1]
+    monkeypatch.setattr(rtoml, "loads", lambda text: {"time": [], "text": "by rtoml"})
+    assert parse_config(text + "#" * LONG, Times, "a.toml").text == "by rtoml"
 
 
 def test_a_missing_configuration_is_named(tmp_path):
