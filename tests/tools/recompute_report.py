@@ -141,6 +141,8 @@ def recompute(path: str) -> dict[str, Any]:
         if kept:
             depths[node] = {"least_m": min(kept), "most_m": max(kept), "sigma_m": rows[-1][1]["sigma_m"]}
     truth = TruePlaces([row for _, row in of("truth")])
+    frames = {row["trigger"] for node in (a, b) for _, row in log.get(f"buddyline/node/{node}/candidates", [])}
+    ended = {row["trigger"] for row in (*poses, *rejected)}
     return {
         "dive": {
             "begun": time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(start // 10**9)),
@@ -149,8 +151,9 @@ def recompute(path: str) -> dict[str, Any]:
             "pair": [a, b],
         },
         "triggers": {
-            "total": len({row["trigger"] for row in (*poses, *rejected)}),
+            "total": len(frames | ended),
             "with_pose": len(poses),
+            "without_outcome": len(frames - ended) if frames else None,
             "rejected": dict(Counter(row["reason"] for row in rejected)),
             "longest_without_pose_s": max(between),
             "without_pose": [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from msgspec import UNSET
 from msgspec.structs import replace
 
 from tests.tools import recompute_report
-from tests.tools.evaluated import INFOS, pose, rejection, track, truth, write_log
+from tests.tools.evaluated import INFOS, frame, pose, rejection, track, truth, write_log
 from tests.tools.recompute_report import differences, numbers_in, recompute
 from tests.tools.watched import at, attitude, image, solver_status, tick
 
@@ -92,6 +93,25 @@ def test_a_message_that_several_recordings_have_counts_once(tmp_path: Path) -> N
     second = write_log(tmp_path / "second.mcap", *messages[10:])
     with Dive([first, second]) as dive:
         assert summarize(dive, None).counts == {"buddyline/node/a/attitude": 40}
+
+
+def test_triggers_whose_outcome_nobody_recorded_are_counted_and_told(tmp_path: Path) -> None:
+    """The nodes' own logs have ten triggers, the recording the outcomes of seven of them, and of one more."""
+    logs = [write_log(tmp_path / f"{node}.mcap", INFOS[node], *(frame(node, k) for k in range(10))) for node in "ab"]
+    outcomes = [*(pose(k) for k in range(3, 9)), rejection(9), rejection(12, "late")]
+    recording = write_log(tmp_path / "recorded.mcap", *INFOS.values(), *outcomes)
+    report = tmp_path / "report.html"
+    assert main(["report", *logs, recording, "-o", str(report)]) == 0
+    page = report.read_text("utf-8")
+    triggers = numbers_in(page)["triggers"]
+    assert (triggers["total"], triggers["with_pose"], triggers["without_outcome"]) == (11, 6, 3)
+    assert "3 triggers of the nodes' frames have no recorded outcome" in unescape(page)
+    assert "<td>without a recorded outcome</td><td>3</td>" in page.replace("\n", "")
+    # The recording alone does not know of them.
+    assert main(["report", recording, "-o", str(tmp_path / "alone.html")]) == 0
+    alone = (tmp_path / "alone.html").read_text("utf-8")
+    assert numbers_in(alone)["triggers"]["without_outcome"] is None
+    assert "recorded outcome" not in alone
 
 
 def test_it_finds_a_number_that_differs() -> None:

@@ -70,7 +70,7 @@ def test_report_and_evaluate_give_one_length_though_the_log_s_times_are_others(t
         summary = summarize(dive, ("a", "b"))
         page = report_html(dive, ("a", "b"))
     (stretch,) = summary.coverage.without()
-    figures = trigger_figures(summary.poses, summary.rejected, [])
+    figures = trigger_figures(summary.poses, summary.rejected, {})
     assert stretch.seconds == figures.gap_s == pytest.approx(2.4)
     assert "<td>longest time without a pose</td><td>2.4 s</td>" in page.replace("\n", "")
     assert "for 2.4 s: more than one arrangement fits (23)" in page

@@ -136,7 +136,9 @@ def evaluate(recorded: Recorded) -> Result:
         node_b=nodes[1],
         poses=len(poses),
         without_truth=len(poses) - len(errors),
-        triggers=trigger_figures(poses, rejected, list(frames.values()), recorded.doubled),
+        triggers=trigger_figures(
+            poses, rejected, {frame.trigger: frame.stamp_ns for frame in frames.values()}, recorded.doubled
+        ),
         skew=skew_figures(poses),
         accuracy=Accuracy.of(errors),
         bins=_bins(errors, seen),

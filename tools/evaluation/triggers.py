@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from buddyline.protocol.messages import Candidates, Rejected, RelativePose
+from buddyline.protocol.messages import Rejected, RelativePose
 from buddyline.tools.evaluation.statistics import share
 from buddyline.tools.evaluation.stretches import Outcome, stretches
 
@@ -43,14 +43,12 @@ class Skew:
 
 
 def trigger_figures(
-    poses: Sequence[RelativePose], rejected: Sequence[Rejected], frames: Sequence[Candidates], doubled: int = 0
+    poses: Sequence[RelativePose], rejected: Sequence[Rejected], frames: Mapping[int, int], doubled: int = 0
 ) -> Triggers:
-    """Return the outcomes of all triggers, including frames without an outcome."""
-    stamps_ns = {frame.trigger: frame.stamp_ns for frame in frames}
-    stamps_ns |= {rejection.trigger: rejection.stamp_ns for rejection in rejected}
+    """Return the outcomes of all triggers, including frames without an outcome; frames: stamps, ns, by trigger."""
+    stamps_ns = dict(frames) | {rejection.trigger: rejection.stamp_ns for rejection in rejected}
     stamps_ns |= {pose.trigger: pose.stamp_ns for pose in poses}
     results = {pose.trigger for pose in poses} | {rejection.trigger for rejection in rejected}
-    asked = {frame.trigger for frame in frames}
     span_s = (max(stamps_ns.values()) - min(stamps_ns.values())) / 1e9 if stamps_ns else 0.0
     outcomes = [Outcome(pose.stamp_ns, pose.stamp_ns, None) for pose in poses]
     outcomes += [Outcome(rejection.stamp_ns, rejection.stamp_ns, rejection.reason) for rejection in rejected]
@@ -58,8 +56,8 @@ def trigger_figures(
     # Without a stretch, the longest time is that from one pose to the next.
     gaps_s = [(end - start) / 1e9 for start, end in pairwise(solved)] + [each.seconds for each in stretches(outcomes)]
     return Triggers(
-        total=len(asked | results),
-        unanswered=len(asked - results) if frames else None,
+        total=len(frames.keys() | results),
+        unanswered=len(frames.keys() - results) if frames else None,
         doubled=doubled,
         rejected=dict(Counter(rejection.reason for rejection in rejected).most_common()),
         span_s=span_s,

@@ -87,6 +87,12 @@ def report_html(
     warnings = [*dive.losses, *authenticity]
     if not summary.poses:
         warnings.append("this log holds no pose; solve it first: buddyline solve DIVE.mcap -o OUT.mcap")
+    missing = numbers["triggers"]["without_outcome"]
+    if missing and missing < numbers["triggers"]["total"]:
+        warnings.append(
+            f"{missing} triggers of the nodes' frames have no recorded outcome: there was no solver, or no recorder; "
+            "solve the nodes' logs again for them"
+        )
     if summary.picture.other_pairs:
         others = ", ".join(f"{a} and {b}" for a, b in sorted(summary.picture.other_pairs))
         warnings.append(f"poses of other pairs are not reported: {others}; choose with --pair A/B")
@@ -127,6 +133,8 @@ def _figures(numbers: dict[str, Any]) -> str:
     if triggers["total"]:
         share = triggers["with_pose"] / triggers["total"]
         rows.append(("with a pose", f"{triggers['with_pose']} ({share:.0%})"))
+    if triggers["without_outcome"] is not None:
+        rows.append(("without a recorded outcome", f"{triggers['without_outcome']}"))
     if track and track["covered"] is not None:
         name = f"covered by the track (1 sd below {TRACK_SIGMA_SHARE:.0%} of the range)"
         rows.append((name, f"{track['covered']:.0%}"))
@@ -220,7 +228,9 @@ def _over_time(summary: Summary) -> str:
 
 def _coverage(summary: Summary) -> str:
     coverage, rejected = summary.coverage, Counter(rejection.reason for rejection in summary.rejected)
-    total = len(summary.poses) + len(summary.rejected)
+    ended = {one.trigger for one in summary.poses} | {one.trigger for one in summary.rejected}
+    # As in the figures: also triggers without an outcome count.
+    total = len(summary.asked.keys() | ended)
     rows = [(reason_words(why), why, f"{count}", f"{count / total:.1%}") for why, count in rejected.most_common()]
     gaps = [stretch for stretch in coverage.without() if stretch.seconds >= MIN_STRETCH_S]
     longest = sorted(sorted(gaps, key=lambda gap: -gap.seconds)[:MAX_STRETCHES], key=lambda gap: gap.begin_ns)

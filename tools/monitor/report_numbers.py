@@ -35,7 +35,7 @@ class ReportAbout(Config, frozen=True, kw_only=True):
 
 def numbers_of(dive: Dive, summary: Summary, outliers: list[Outlier] | None, about: ReportAbout) -> dict[str, Any]:
     """Return the numbers. Times are s, from the dive's first message where they are not stamps."""
-    triggers = trigger_figures(summary.poses, summary.rejected, [])
+    triggers = trigger_figures(summary.poses, summary.rejected, summary.asked)
     gaps = [stretch for stretch in summary.coverage.without() if stretch.seconds >= MIN_STRETCH_S]
     return {
         "about": msgspec.to_builtins(about),
@@ -49,6 +49,7 @@ def numbers_of(dive: Dive, summary: Summary, outliers: list[Outlier] | None, abo
             "total": triggers.total,
             "with_pose": len(summary.poses),
             "rejected": triggers.rejected,
+            "without_outcome": triggers.unanswered,
             "longest_without_pose_s": triggers.gap_s,
             "without_pose": [
                 {

@@ -8,7 +8,7 @@ from typing import Final
 
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.health import TRACK_SIGMA_SHARE
-from buddyline.protocol.messages import Depth, NodeInfo, Rejected, RelativePose, Track, Truth
+from buddyline.protocol.messages import Candidates, Depth, NodeInfo, Rejected, RelativePose, Track, Truth
 from buddyline.tools.dives import Dive
 from buddyline.tools.estimate import Estimate, sigma_m
 from buddyline.tools.evaluation.poses import PoseErrors, pose_errors
@@ -44,11 +44,11 @@ class JudgedPicture:
 class Summary:
     """The report's content about one pair.
 
-    points: its poses, tracks: its track; of each only some, spacing_ns apart at least. dark_s: the longest time in
-    which the track used no light. track_coverage: where the track covers the dive, None without a track.
-    depths: by node, (ns, m). depth_sigma_m: by node, the gauge's stated one. path: all places of the track.
-    infos: by node, one for each calibration that it had. counts: messages by key, each once,
-    of however many logs.
+    points: its poses, tracks: its track; of each only some, spacing_ns apart at least. asked: stamps of the pair's
+    frames, ns, by trigger. dark_s: the longest time in which the track used no light. track_coverage: where the track
+    covers the dive, None without a track. depths: by node, (ns, m). depth_sigma_m: by node, the gauge's stated one.
+    path: all places of the track. infos: by node, one for each calibration that it had. counts: messages by key, each
+    once, of however many logs.
     """
 
     picture: PairPicture
@@ -60,6 +60,7 @@ class Summary:
     track_coverage: Coverage | None = None
     poses: list[RelativePose] = field(default_factory=list)
     rejected: list[Rejected] = field(default_factory=list)
+    asked: dict[int, int] = field(default_factory=dict)
     truths: list[Truth] = field(default_factory=list)
     depths: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
     depth_sigma_m: dict[str, float] = field(default_factory=dict)
@@ -120,6 +121,9 @@ def summarize(dive: Dive, pair: Pair | None) -> Summary:
                 summary.track_coverage.add(at_ns, "uncertain" if uncertain else None)
                 _keep(summary, summary.tracks, message, at_ns)
                 summary.path.add(message)
+        elif isinstance(message, Candidates):
+            if pair is not None and message.node in pair:
+                summary.asked.setdefault(message.trigger, message.stamp_ns)
         elif isinstance(message, Depth):
             line = summary.depths.setdefault(message.node, [])
             summary.depth_sigma_m[message.node] = message.sigma_m
