@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Iterable, Iterator
+from itertools import islice
 from typing import Final, NamedTuple
 
 # Of a page, unless a single message is larger: a page on its way delays what is more urgent.
@@ -46,9 +47,8 @@ class Held:
     def find(self, first: int, last: int) -> tuple[int, list[HeldMessage]]:
         """Return the number of the oldest message that is held, and those from `first` to `last`."""
         with self._lock:
-            found = list(self._messages)
-        oldest = found[0].number if found else 0
-        return oldest, found[max(first - oldest, 0) : max(last + 1 - oldest, 0)]
+            oldest = self._messages[0].number if self._messages else 0
+            return oldest, list(islice(self._messages, max(first - oldest, 0), max(last + 1 - oldest, 0)))
 
 
 def asked(text: str) -> tuple[int, int]:
