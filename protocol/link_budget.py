@@ -53,7 +53,9 @@ class LinkBudget:
         self._offered = 0.0
         self._kept_s: dict[str, float] = {}
         self._seen: deque[tuple[float, float, TcpState]] = deque()
-        self._clear_s = self._reduced_s = self._shed_s = float("-inf")
+        self._clear_s = self._full_s = self._reduced_s = self._shed_s = float("-inf")
+        # When the other end last acknowledged something while the link was full.
+        self._moved_s = float("-inf")
         self._counted_s = 0.0
         self._sent: Counter[str] = Counter()
         self._left_out: Counter[str] = Counter()
@@ -116,15 +118,27 @@ class LinkBudget:
             return True
 
     def observe(self, state: TcpState, now_s: float) -> None:
-        """Take the state of the connection, ten times a second; a new connection begins with `forget`."""
+        """Take the state of the connection, ten times a second; a new connection begins with `forget`.
+
+        A link on which nothing is acknowledged is cut, or waits for a lost packet: nothing is learned from that.
+        """
         with self._lock:
+            patience_s = FULL_S + 2.0 * state.min_rtt_s
+            moved = bool(self._seen) and state.acked > self._seen[-1][2].acked
+            if moved and now_s - max(self._moved_s, self._clear_s) > patience_s:
+                self._seen.clear()
+                self._full_s = now_s
             self._seen.append((now_s, self._offered, state))
             while now_s - self._seen[0][0] > OBSERVED_S:
                 self._seen.popleft()
             if state.waiting < FULL_BYTES:
-                self._clear_s = now_s
-            if now_s - self._clear_s > FULL_S:
-                self._reduce(now_s)
+                self._clear_s = self._full_s = now_s
+                self._moved_s = float("-inf")
+            elif moved:
+                self._moved_s = now_s
+            if now_s - self._full_s > FULL_S:
+                if now_s - self._moved_s <= patience_s:
+                    self._reduce(now_s)
             elif self._limit is not None and now_s - self._reduced_s > AGAIN_S and len(self._seen) > 1:
                 self._limit *= 1.0 + MORE_PER_S * (now_s - self._seen[-2][0])
                 if now_s - max(self._shed_s, self._reduced_s) > LIFT_S:
@@ -134,7 +148,8 @@ class LinkBudget:
         """Begin anew with another connection; the limit stays."""
         with self._lock:
             self._seen.clear()
-            self._clear_s = now_s
+            self._clear_s = self._full_s = now_s
+            self._moved_s = float("-inf")
 
     def words(self, now_s: float) -> str:
         """Return what the link leaves out, and how late the rest is, for people; "" if nothing."""

@@ -79,6 +79,34 @@ def test_a_link_that_recovers_carries_everything_again() -> None:
     assert sent["imu"] == 12000
 
 
+@pytest.mark.parametrize("new_connection", [False, True], ids=["the same connection", "another connection"])
+@pytest.mark.parametrize("cut_s", [1.0, 2.5, 15.0])
+def test_a_cut_teaches_nothing(cut_s: float, new_connection: bool) -> None:
+    """A link of 1 MB/s is cut. Once what has gathered is sent, it carries what it carried before."""
+    budget, waiting, acked = LinkBudget(), 0.0, 0.0
+    sent: Counter[str] = Counter()
+    budget.forget(0.0)
+    least = float("inf")
+    for step in range(round((20.0 + cut_s) / STEP_S)):
+        now_s = step * STEP_S
+        for topic, rate_hz, size in SENT:
+            for _ in range(int((step + 1) * STEP_S * rate_hz) - int(step * STEP_S * rate_hz)):
+                if budget.admits(topic, size, now_s):
+                    waiting += size + OVERHEAD_BYTES
+                    sent[topic.name] += now_s >= 12.0 + cut_s
+        if not 10.0 <= now_s < 10.0 + cut_s:
+            carried = min(waiting, 1e6 * STEP_S)
+            waiting, acked = waiting - carried, acked + carried
+        elif new_connection and step == round((10.0 + cut_s) / STEP_S) - 1:
+            waiting = acked = 0.0
+            budget.forget(now_s)
+        if step % 10 == 9:
+            budget.observe(TcpState(int(acked), int(waiting), 0, 0, 0.001), now_s)
+        least = min(least, budget.bytes_per_s or float("inf"))
+    assert sent == {topic.name: rate_hz * 8 for topic, rate_hz, _ in SENT}
+    assert least > 10 * sum(rate_hz * (size + OVERHEAD_BYTES) for _, rate_hz, size in SENT)
+
+
 def test_copies_go_on_a_slow_link_that_is_not_behind() -> None:
     budget = LinkBudget()
     run(1e6, 5.0, budget)
