@@ -104,6 +104,34 @@ def test_a_svx_file_goes_out_to_therion(tmp_path):
 
 @CAVERN
 @THERION
+def test_what_therion_refuses_a_file_for_is_not_written(tmp_path):
+    text = """
+*fix b 0 0 0
+*fix b2 0 0 0
+*fix other 1 2 3
+*equate b b2
+*equate a c1
+*equate c1 c
+a b 5 10 0
+a c 1 0 0
+c d 4 20 10
+*entrance c1
+*entrance other
+"""
+    expected = by_cavern(tmp_path, text, "cave")
+    old = read_old(tmp_path / "cave.svx")
+    lines = th_of(old).lines
+    assert [line for line in lines if line.startswith("#")] == [
+        "# no shot, as both its ends are one station: cave.svx:9"
+    ]
+    assert sum("fix b" in line for line in lines) == 1
+    found = in_therion(tmp_path, old)
+    # Therion gives no equal names and no lone points.
+    assert_same(found, {name: expected[name] for name in ("a", "b", "d")}, fixed=True)
+
+
+@CAVERN
+@THERION
 @pytest.mark.parametrize("system", ["", "UTM33"])
 def test_a_th_file_goes_in_and_out_of_both(tmp_path, system):
     text = TH.replace('station 1 "mouth"', f'cs {system}\n    fix 1 420000 5260000 50\n    station 1 "mouth"')

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any, Final
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import ConfigError
 from buddyline.tools.survey.geodesy import utm_epsg
-from buddyline.tools.survey.old.model import LEAST_M, North, OldShot, OldSurvey, StationName
+from buddyline.tools.survey.old.model import LEAST_M, North, OldShot, OldSurvey, StationName, merged
 from buddyline.tools.survey.old.readers import read_old
 from buddyline.tools.survey.old.systems import DEGREES, crs_of, map_system, moved
 from buddyline.tools.survey.project import STATION_NAME, FixedPoint, Leg, Project, Station
@@ -152,24 +152,7 @@ def joined(project: Project, olds: Sequence[OldSurvey]) -> Project:
 def same_place(project: Project, olds: Sequence[OldSurvey]) -> Callable[[StationName], StationName]:
     """Return the name that stands for a station, of those that the project and old surveys say are one place."""
     stated = [tuple(one.stations) for one in project.equate]
-    return _merged([*stated, *(same for old in olds for same in old.equates)])
-
-
-def _merged(equates: Iterable[tuple[StationName, ...]]) -> Callable[[StationName], StationName]:
-    """Return the name that stands for each station, the first that was stated of each place."""
-    parent: dict[StationName, StationName] = {}
-
-    def root(name: StationName) -> StationName:
-        while name in parent:
-            name = parent[name]
-        return name
-
-    for first, *others in equates:
-        for other in others:
-            one, two = root(first), root(other)
-            if one != two:
-                parent[two] = one
-    return root
+    return merged([*stated, *(same for old in olds for same in old.equates)])
 
 
 def legs_of(survey: OldSurvey) -> list[Leg]:

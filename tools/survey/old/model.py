@@ -6,7 +6,7 @@ Metres and degrees, with instruments' calibrations taken off; the angle to north
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import date
 from typing import Final, Literal, TypeAlias
@@ -222,3 +222,20 @@ class OldSurvey:
     def notes_of(self, path: SurveyPath) -> SurveyNotes:
         """Return the notes of a survey, to be added to."""
         return self.surveys.setdefault(path, SurveyNotes())
+
+
+def merged(equates: Iterable[tuple[StationName, ...]]) -> Callable[[StationName], StationName]:
+    """Return the name that stands for each station, the first that was stated of each place."""
+    parent: dict[StationName, StationName] = {}
+
+    def root(name: StationName) -> StationName:
+        while name in parent:
+            name = parent[name]
+        return name
+
+    for first, *others in equates:
+        for other in others:
+            one, two = root(first), root(other)
+            if one != two:
+                parent[two] = one
+    return root

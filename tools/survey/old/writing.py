@@ -17,6 +17,7 @@ from buddyline.tools.survey.old.model import (
     Passage,
     StationName,
     SurveyPath,
+    merged,
 )
 from buddyline.tools.survey.old.systems import DEGREES, convergence_deg, map_system
 
@@ -309,8 +310,10 @@ def remark_of(shot: OldShot) -> str:
 
 def th_of(survey: OldSurvey, system: str = "") -> Written:
     """Return a survey in the language of Therion, without a heading. system: the map grid, if not the survey's own."""
-    names = _Names("A-Za-z0-9_.\\-'/+*")
-    lines = list(_th_block(survey, tree_of(survey), names, convergence_deg(survey, system)))
+    names, turn_deg = _Names("A-Za-z0-9_.\\-'/+*"), convergence_deg(survey, system)
+    survey, refused, known_as = _accepted_by_therion(survey)
+    lines = list(_th_block(survey, tree_of(survey), names, turn_deg))
+    lines += [f"# no shot, as both its ends are one station: {remark_of(shot)}" for shot in refused]
     tail = list(_fixes(survey, "fix", lambda name: f"cs {therion_system(name)}", "", names, _at))
     tail += [f'station {_at(names.anywhere(one))} "" entrance' for one in survey.entrances]
     lines += ["centreline", *(f"  {line}" for line in tail), "endcentreline"] if tail else []
@@ -319,7 +322,36 @@ def th_of(survey: OldSurvey, system: str = "") -> Written:
         *names.equates,
     ]
     lines += [f"equate {' '.join(map(_at, same))}" for same in every]
-    return Written(lines, lambda name: _at(names.anywhere(name)))
+    return Written(lines, lambda name: _at(names.anywhere(known_as(name))))
+
+
+def _accepted_by_therion(survey: OldSurvey) -> tuple[OldSurvey, list[OldShot], Callable[[StationName], StationName]]:
+    """Return a survey without what Therion refuses a file for, its shots without a length, and what to name a station.
+
+    Refused are shots between equated stations, a place's second fixed point, and stations without shot or fixed point.
+    """
+    place = merged(survey.equates)
+    within = [bool(shot.start and shot.end) and place(shot.start) == place(shot.end) for shot in survey.shots]
+    fixes = {place(fix.station): fix for fix in reversed(survey.fixes)}
+    shots = [shot for shot, out in zip(survey.shots, within, strict=True) if not out]
+    kept = replace(survey, shots=shots, fixes=list(reversed(fixes.values())))
+    places: dict[StationName, list[StationName]] = {}
+    for name in kept.stations:
+        places.setdefault(place(name), []).append(name)
+
+    def known_as(name: StationName) -> StationName:
+        there = places.get(place(name), [name])
+        return name if name in there else there[0]
+
+    return (
+        replace(
+            kept,
+            equates=[tuple(same) for same in places.values() if len(same) > 1],
+            entrances=[known_as(one) for one in survey.entrances if place(one) in places],
+        ),
+        [shot for shot, out in zip(survey.shots, within, strict=True) if out],
+        known_as,
+    )
 
 
 def survex_system(system: str) -> str:
