@@ -205,7 +205,8 @@ def compare(world: World, ours: Run, best: Run, nodes: tuple[str, str], figures:
     figures.ratios[f"{name}, RMS / bound"].add(way[:, 0], told_way[:, 1])
     figures.ratios[f"{name} told, RMS / bound"].add(told_way[:, 0], told_way[:, 1])
     figures.ratios[f"{name}, RMS / composed bound"].add(way[:, 0], told_way[:, 2])
-    lines = []
+    over = [math.sqrt(of[:, 0].mean() / told_way[:, 1].mean()) if same else math.nan for of in (way, told_way)]
+    lines = [f"  {name}: RMS over the joint bound {over[0]:.2f}, told {over[1]:.2f}"]
     for node, one in sorted(found.items()):
         median_mm = 1000.0 * math.sqrt(float(np.median(one.squared_m2)))
         rms_mm, sigma_mm = (1000.0 * math.sqrt(float(of.mean())) for of in (one.squared_m2, one.variance_m2))

@@ -191,6 +191,15 @@ def test_a_stored_dive_is_played_and_scrubbed(chromium: Any, processes: Processe
         seen.page.keyboard.press("ArrowLeft")
         seen.wait_for("0:19.8 of 0:59.9")
         seen.screenshot("end")
+        seen.page.locator("#above").click()
+        # From above: what is north is up, and what is east is right.
+        seen.page.wait_for_function(
+            """() => { const [north, east] = [[1, 0, 0], [0, 1, 0]].map((by) => scene.project(plus(scene.target, by)));
+            const middle = scene.project(scene.target);
+            return scene.fitted && north[1] < middle[1] - 10 && Math.abs(north[0] - middle[0]) < 1
+                && east[0] > middle[0] + 10 && Math.abs(east[1] - middle[1]) < 1; }"""
+        )
+        seen.screenshot("above")
         seen.check_clean()
 
 

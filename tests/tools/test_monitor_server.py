@@ -28,6 +28,7 @@ from buddyline.tools.monitor.playback import Playback, cover
 from buddyline.tools.monitor.server import FILES, PageServer, open_listener
 from buddyline.tools.monitor.view import DiveSession
 from buddyline.tools.pairs import Pair
+from msgspec.structs import replace
 
 from tests.processes import REPOSITORY
 from tests.tools.evaluated import INFOS, RIGHT, info, pose, rejection, track, write_log
@@ -239,9 +240,21 @@ class TestFrames:
                 v_mps=(0.0, 0.0, 0.0), covariance=[0.0] * 36, fixed=False, mode="filter", age_s=0.0,
             )  # fmt: skip
             take(overview, place, at(29))
+        take(overview, depth("d", at(29), 13.0), at(29))
         nodes = {node["id"]: node for node in Viewer(live=True).frame(overview, at(29))["scene"]["nodes"]}
         assert set(nodes) == {"a", "b", "c", "d"}
         assert nodes["d"]["t"] == [4.0, 0.0, 0.0]
+        assert nodes["d"]["label"] == "d, 13.0 m deep"
+
+    def test_a_team_is_well_when_all_its_nodes_send(self) -> None:
+        overview = filled()
+        assert "both nodes send" in Viewer(live=False).frame(overview, at(29))["banner"]["text"]
+        take(overview, replace(INFOS["b"], node="c"), at(0))
+        for k in range(30):
+            for message in tick(k):
+                if getattr(message, "node", "") == "b":
+                    take(overview, replace(message, node="c"), at(k))
+        assert "all nodes send" in Viewer(live=False).frame(overview, at(29))["banner"]["text"]
 
     def test_any_number_of_any_message_can_be_plotted(self) -> None:
         overview, viewer = filled(), Viewer(live=True)

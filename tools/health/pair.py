@@ -60,7 +60,9 @@ def findings(picture: PairPicture, now_ns: int, *, live: bool = True) -> list[Fi
             )
         else:
             better = ", ".join(_told(picture, now_ns))
-            said.append(Finding("pair", "ok", "All is well: both nodes send, and the solver finds the pose.", better))
+            who = "both" if len(picture.nodes) <= 2 else "all"
+            text = f"All is well: {who} nodes send, and the solver finds the pose."
+            said.append(Finding("pair", "ok", text, better))
     return worst_first(said)
 
 

@@ -254,7 +254,7 @@ def _of_net(overview: Overview, name_a: str | None, placed: set[str], now_ns: in
             t_m = np.subtract(pose.p_m, base[0].p_m)
             R = quat_to_matrix(np.array(pose.q_xyzw))
             stale = now_ns - at_ns > S_NS
-            label = f"{name} (net {pose.net})"
+            label = f"{name}{_depth_words(overview.nodes.get(name))}"
             found.append({"id": name, "label": label, "t": t_m.tolist(), "R": _flat(R), "stale": stale})
     return found
 

@@ -146,7 +146,7 @@ function drawScene() {
   const spots = trail();
   if (isOther) for (const spot of spots) spot.t = spot.t.map((x) => -x);
   if (byId("still").value.endsWith(WITH_CAMERA) && told.nodes.length) told = asSeenFrom(told, spots);
-  scene.fit(told.nodes.slice(0, 2).map((one) => minus(one.t, origin)));
+  scene.fit(told.nodes.filter((one, k) => k < 2 || !one.stale).map((one) => minus(one.t, origin)));
   scene.draw({ ...told, rigs: state.rigs, trail: spots, origin, follows: isOther ? () => [0, 0, 0] : null }, colours);
 }
 
@@ -299,12 +299,13 @@ const toggles = {
   },
   light: (on) => { document.documentElement.classList.toggle("light", on); readColours();
     plots.forEach((plot) => plot.remake()); drawn = false; },
+  above: (on) => { scene.lookDown(on); byId("fit").onclick(); },
   sound: (on) => { tone = on ? new AudioContext() : null; },
 };
 function toggle(name, on) {
   byId(name).setAttribute("aria-pressed", String(on));
   toggles[name](on);
-  if (name !== "sound") { try { localStorage.setItem(name, on ? "1" : "0"); } catch { /* not kept */ } }
+  if (name !== "sound" && name !== "above") { try { localStorage.setItem(name, on ? "1" : "0"); } catch { /* not kept */ } }
 }
 const isOn = (name) => byId(name).getAttribute("aria-pressed") === "true";
 for (const name of Object.keys(toggles)) byId(name).onclick = () => toggle(name, !isOn(name));
@@ -320,7 +321,7 @@ byId("speed").onchange = () => commands({ speed: Number(byId("speed").value) });
 byId("loop").onchange = () => commands({ loop: byId("loop").checked });
 byId("at").oninput = () => { holding = true; commands({ seek: Number(byId("at").value) }); };
 byId("at").onchange = () => { holding = false; };
-const KEYS = { d: "deck", l: "light", s: "sound", f: "fit", " ": "play", ArrowLeft: "back", ArrowRight: "step", n: "nextgap",
+const KEYS = { d: "deck", l: "light", s: "sound", f: "fit", a: "above", " ": "play", ArrowLeft: "back", ArrowRight: "step", n: "nextgap",
   p: "lastgap" };
 addEventListener("keydown", (event) => {
   const id = KEYS[event.key];

@@ -14,7 +14,7 @@ class Scene {
     this.tilt = 0.45;
     this.distance = 7;
     this.target = [1.5, 0, 0];
-    this.chosen = false;
+    this.chosen = this.above = false;
     this.width = this.height = 0;
     const held = new Map();
     canvas.addEventListener("pointerdown", (e) => { held.set(e.pointerId, e); canvas.setPointerCapture(e.pointerId); });
@@ -48,20 +48,28 @@ class Scene {
     this.chosen = true;
   }
 
-  // Turn the view to these places, unless the viewer has chosen it or they are still well inside.
+  // Turn the view to these places, the pair's first, unless the viewer has chosen it or they are still well inside.
   fit(places, again) {
     if (again) this.chosen = false;
     if (this.chosen || !places.length) return;
-    const far = places.reduce((a, b) => (Math.hypot(...b) > Math.hypot(...a) ? b : a));
-    const range = Math.hypot(...far);
-    const middle = far.map((x) => x / 2);
-    const wanted = 1.15 * range + 2;
+    const far = places.slice(0, 2).reduce((a, b) => (Math.hypot(...b) > Math.hypot(...a) ? b : a));
+    const ends = [Math.min, Math.max].map((most) => [0, 1, 2].map((k) => most(...places.map((place) => place[k]))));
+    const range = Math.hypot(...minus(ends[1], ends[0]));
+    const middle = plus(ends[0], ends[1]).map((x) => x / 2);
+    const wanted = (this.above ? 1.6 : 1.15) * range + 2;
     if (!again && this.fitted && Math.hypot(...minus(middle, this.target)) < 0.15 * this.distance &&
       Math.abs(wanted - this.distance) < 0.25 * this.distance) return;
     this.fitted = true;
     this.target = middle;
     this.distance = wanted;
-    if (range > 0.2) this.turn = Math.atan2(far[1], far[0]) + 2.0;
+    if (this.above) this.turn = Math.PI;
+    else if (range > 0.2) this.turn = Math.atan2(far[1], far[0]) + 2.0;
+  }
+
+  // From above, north up; or from the side again.
+  lookDown(above) {
+    this.above = above;
+    this.tilt = above ? 1.5 : 0.45;
   }
 
   project(p) {
@@ -94,13 +102,21 @@ class Scene {
     this.pen.fill();
   }
 
-  text(a, words, colour, size = 12) {
+  // clear: move it up until it is clear of the others that are.
+  text(a, words, colour, size = 12, clear = false) {
     const p = this.project(a);
     if (!p) return;
     this.pen.fillStyle = colour;
     this.pen.font = `${size * this.ratio}px system-ui, sans-serif`;
-    const wide = this.pen.measureText(words).width;
-    this.pen.fillText(words, Math.min(p[0] + 6 * this.ratio, this.width - wide - 4 * this.ratio), p[1] - 6 * this.ratio);
+    const wide = this.pen.measureText(words).width, high = 1.25 * size * this.ratio;
+    const x = Math.min(p[0] + 6 * this.ratio, this.width - wide - 4 * this.ratio);
+    let y = p[1] - 6 * this.ratio;
+    if (clear) {
+      const hit = () => this.labels.find((one) => x < one.x + one.wide && one.x < x + wide && Math.abs(y - one.y) < high);
+      for (let one = hit(); one; one = hit()) y = one.y - high;
+      this.labels.push({ x, y, wide });
+    }
+    this.pen.fillText(words, x, y);
   }
 
   // The outline of an ellipsoid: its three principal ellipses.
@@ -136,7 +152,7 @@ class Scene {
     this.line(put(rig.lights[0]), put(rig.lights[1]), colour, 3);
     this.ball(put(rig.lights[0]), node.stale ? colour : colours.left, 0.035);
     this.ball(put(rig.lights[1]), node.stale ? colour : colours.right, 0.035);
-    this.text(plus(node.t, [0, 0, -0.25]), node.label, colour, 13);
+    this.text(plus(node.t, [0, 0, -0.25]), node.label, colour, 13, true);
   }
 
   // what: nodes (A first), rigs by id, trail [{t, age 0..1, joined, tracked}], levelled, depth (of A, m), origin
@@ -148,6 +164,7 @@ class Scene {
     this.height = this.canvas.height = Math.max(1, Math.round(box.height * this.ratio));
     this.pen.fillStyle = colours.back;
     this.pen.fillRect(0, 0, this.width, this.height);
+    this.labels = [];
     const origin = what.origin || [0, 0, 0];
     const nodes = what.nodes.map((node) => ({ ...node, t: minus(node.t, origin) }));
     const floor = -origin[2];
