@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 import buddyline
 import pytest
 from buddyline.tools.cli import main
+
+from tests.processes import REPOSITORY
 
 
 @pytest.fixture
@@ -25,6 +29,23 @@ def test_the_sample_is_solved_reported_and_right(here, capsys):
     assert "track (smooth): covers 100.0 %" in told
     dive = buddyline.open_dive("sample.mcap")
     assert len(dive.depths("a")) > 100
+
+
+def test_its_figures_are_the_tutorial_s_and_its_sigmas_those_of_today_s_detector(here, capsys):
+    assert main(["sample"]) == 0
+    assert main(["solve", "sample.mcap", "-o", "poses.mcap"]) == 0
+    tutorial = (REPOSITORY / "docs" / "tutorial.md").read_text()
+    poses, triggers = re.search(r"gave a pose, (\d+) of (\d+), and why", tutorial).groups()
+    assert f"{poses} poses of {triggers} triggers" in capsys.readouterr().out
+    assert main(["evaluate", "poses.mcap"]) == 0
+    told = capsys.readouterr().out
+    assert f'"wrong poses ... 0 of {poses}"' in tutorial
+    assert f"of the range): 0 of {poses}," in told
+    median_m = re.search(r"off by ([\d.]+) m in the\s+median", tutorial)[1]
+    assert re.search(rf"^position, m +{poses} +{median_m} ", told, re.MULTILINE)
+    # The candidates are stored with their sigmas: after a new fit of these the sample is to be made again.
+    nees = re.search(r"^NEES, pose .* ([\d.]+)$", told, re.MULTILINE)[1]
+    assert 3.0 < float(nees) < 9.0
 
 
 def test_a_file_is_never_overwritten(here, capsys):
