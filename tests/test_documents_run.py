@@ -30,12 +30,16 @@ DOCUMENTS = (
     "docs/dives.md",
     "docs/network.md",
     "docs/security.md",
+    "docs/install.md",
     "node/README.md",
     "tools/survey/README.md",
 )
-COMMAND = re.compile(r"^(?:\$ )?(?:buddyline|make|sudo|kill|\.|git|scp|pip|python3?|\.venv/bin/\S+) ?")
+COMMAND = re.compile(
+    r"^(?:\$ )?(?:buddyline|make|mkdir|pipx|sha256sum|sudo|kill|\.|git|scp|pip|python3?|\.venv/bin/\S+) ?"
+)
 LEFT_OUT = {
     r"^sudo |^git |^scp ": "another machine, or root",
+    r"^pipx? |^sha256sum ": "a release; tests/test_release.py",
     r"^make ": "the tests of the Makefile run it, or .ci/run",
     r"^\. \.venv": "the programs are on the path",
     r"^buddyline (view|monitor)": "a page until Ctrl-C; tests/tools/test_monitor_browser.py",

@@ -59,3 +59,10 @@ def test_nothing_is_overwritten_and_nonsense_is_refused(tmp_path, capsys, monkey
     assert main(["init", "hub", "--simulated"]) == 2
     assert main(["init", "solver", "-o", "x.toml", "--connect", "nowhere"]) == 2
     assert not (tmp_path / "x.toml").exists()
+
+
+@pytest.mark.parametrize("words", [("node",), ("node", "--simulated"), ("hub",), ("solver",)])
+def test_marks_are_named_where_there_are_any(words, tmp_path, capsys):
+    path = tmp_path / "new.toml"
+    assert main(["init", *words, "-o", str(path)]) == 0
+    assert ("what is marked with <-" in capsys.readouterr().out) == ("# <-" in path.read_text())

@@ -76,8 +76,10 @@ def run(args: argparse.Namespace) -> int:
     )
     if args.simulated and args.service != "node":
         raise BuddylineError(f"--simulated: a {args.service} has no camera")
-    write_new(path, text_of(args.service, args.node, args.connect, simulated=args.simulated))
-    print(f"{path}: written; set what is marked with <-\nnext: buddyline {args.service} --config {path}")
+    text = text_of(args.service, args.node, args.connect, simulated=args.simulated)
+    write_new(path, text)
+    marked = "; set what is marked with <-" if "<-" in text else ""
+    print(f"{path}: written{marked}\nnext: buddyline {args.service} --config {path}")
     if args.service == "node" and not args.simulated:
         print(f"      buddyline doctor --config {path}      # says what is missing before a dive")
     return 0
