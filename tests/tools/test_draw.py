@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import xml.etree.ElementTree as ET
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +59,29 @@ class TestMarks:
 
 
 class TestFigures:
+    def test_panels_of_trajectories_can_be_read_however_far_aside_a_diver_is(self) -> None:
+        from buddyline.tools.draw.errors import trajectories
+
+        pytest.importorskip("matplotlib")
+        forward_m = np.linspace(1.5, 9.0, 40)
+        near_m = np.stack([np.sin(forward_m), 0.5 * np.cos(forward_m), forward_m], axis=1)
+        aside_m, far_m = near_m.copy(), 20.0 * near_m
+        aside_m[-3:, 0] = -6.4, 4.0, 3.0
+        figure = trajectories({"near": (near_m, []), "aside": (aside_m, []), "far": (far_m, [])})
+        figure.draw_without_rendering()
+        (legend,) = figure.legends
+        for axis in figure.axes:
+            assert not legend.get_window_extent().overlaps(axis.get_window_extent())
+            for labels in (axis.get_xticklabels(), axis.get_yticklabels()):
+                boxes = [label.get_window_extent() for label in labels if label.get_text()]
+                assert len(boxes) > 1
+                assert not any(one.overlaps(other) for one, other in pairwise(boxes))
+            across_m, along_m = (abs(high - low) for low, high in (axis.get_ylim(), axis.get_xlim()))
+            assert across_m < 1.6 * along_m
+        # All that lies aside is in the panel, and the way forward fills most of it.
+        low_m, high_m = figure.axes[2].get_xlim()
+        assert high_m - low_m < 14.0
+
     def test_an_inline_figure_contains_its_text_and_makes_no_request(self) -> None:
         figure, (axis,) = figures.new_figure(4.0, 3.0)
         axis.plot(*figures.broken(np.array([0.0, 1.0, 9.0]), np.array([1.0, 2.0, 3.0])))

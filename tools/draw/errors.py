@@ -18,8 +18,10 @@ if TYPE_CHECKING:
 
 # The width of a printed page between its margins, inches: a figure that is not scaled keeps the size of its letters.
 PRINTED_IN: Final = 7.2
-# Up to this distance from A, m, each metre of an axis has its number.
-NUMBERED_M: Final = 13.0
+# A panel's width and the bounds of its height, inches, and how far apart the numbers at its axes are at least.
+PANEL_IN: Final = 3.0
+PANEL_HEIGHTS_IN: Final = (1.4, 3.4)
+NUMBERS_APART_IN: Final = (0.25, 0.2)
 FILES: Final = ("trajectory.png", "errors_over_time.png", "errors_over_range.png", "normalized_error.png")
 
 
@@ -48,9 +50,11 @@ def by_verdict(errors: PoseErrors) -> list[ErrorCurve]:
 
 def trajectories(dives: Mapping[str, tuple[Floats, Sequence[ErrorCurve]]]) -> Figure:
     """Draw B before A in each dive, from above and from the side; of each its true positions (n, 3), m. Grid: 1 m."""
-    figure, axes = new_figure(PRINTED_IN, 0.5 + 1.9 * len(dives), len(dives), 2)
+    heights_in = [_height_in(true_m) for true_m, _ in dives.values()]
+    figure, axes = new_figure(
+        PRINTED_IN, 0.6 + sum(heights_in) + 0.4 * len(dives), len(dives), 2, gridspec_kw={"height_ratios": heights_in}
+    )
     for row, (title, (true_m, curves)) in enumerate(dives.items()):
-        step_m = 1.0 if np.abs(true_m).max() < NUMBERED_M else 5.0
         for axis, across, name in ((axes[2 * row], 0, "right"), (axes[2 * row + 1], 1, "down")):
             axis.plot(true_m[:, 2], true_m[:, across], ".", color="0.7", markersize=3, label="truth")
             for curve in curves:
@@ -58,7 +62,7 @@ def trajectories(dives: Mapping[str, tuple[Floats, Sequence[ErrorCurve]]]) -> Fi
             axis.plot(0, 0, "k>", markersize=6)
             axis.set(ylabel=f"{name}, m", aspect="equal", adjustable="datalim")
             for one in (axis.xaxis, axis.yaxis):
-                one.set_major_locator(_multiples(step_m))
+                one.set_major_locator(_multiples(1.0))
                 one.set_minor_locator(_multiples(1.0))
             axis.grid(visible=True, which="both")
             # What is right of A, or below it, is drawn below A.
@@ -67,8 +71,35 @@ def trajectories(dives: Mapping[str, tuple[Floats, Sequence[ErrorCurve]]]) -> Fi
         axes[2 * row + 1].set_title("from the side", loc="left")
     for axis in axes[-2:]:
         axis.set_xlabel("forward, m")
-    axes[0].legend()
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=4)
+    # The limits of axes of one scale follow from the panels' sizes, and these from the layout.
+    figure.draw_without_rendering()
+    for axis in axes:
+        panel = axis.get_window_extent()
+        for one, limits_m, length_px, apart_in in (
+            (axis.xaxis, axis.get_xlim(), panel.width, NUMBERS_APART_IN[0]),
+            (axis.yaxis, axis.get_ylim(), panel.height, NUMBERS_APART_IN[1]),
+        ):
+            m_per_in = abs(limits_m[1] - limits_m[0]) / (length_px / figure.dpi)
+            one.set_major_locator(_multiples(_step_m(apart_in * m_per_in)))
     return figure
+
+
+def _height_in(true_m: Floats) -> float:
+    """Return how high a panel must be that shows these positions, and A, in one scale."""
+    seen_m = np.vstack([true_m, np.zeros(3)])
+    right_m, down_m, forward_m = np.ptp(seen_m, axis=0)
+    return float(np.clip(PANEL_IN * max(right_m, down_m) / max(forward_m, 1e-3), *PANEL_HEIGHTS_IN))
+
+
+def _step_m(least_m: float) -> float:
+    """Return the first of 1, 2, 5, 10, 20, ... m that is at least this."""
+    decade_m = 1.0
+    while True:
+        for step in (1.0, 2.0, 5.0):
+            if step * decade_m >= least_m:
+                return step * decade_m
+        decade_m *= 10.0
 
 
 def _multiples(step: float) -> Any:
