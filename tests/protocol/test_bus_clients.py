@@ -49,6 +49,28 @@ def test_a_blocked_handler_does_not_starve_another(client: Connect) -> None:
     go_on.set()
 
 
+def test_what_comes_is_told_before_it_waits_for_the_handler(client: Connect) -> None:
+    bus, node = client(), client()
+    go_on, arrived, handled = threading.Event(), list[tuple[str, bytes]](), list[bytes]()
+
+    def slow(received: Received) -> None:
+        assert go_on.wait(PATIENCE_S)
+        handled.append(received.payload)
+
+    publisher = node.publisher(topics.REJECTED, "a", "b")
+    publisher.put(rejected(0))
+    bus.subscribe("buddyline/pair/*/*/rejected", slow, on_arrival=lambda key, payload: arrived.append((key, payload)))
+    # What was held has come, too.
+    assert [key for key, _ in arrived] == [publisher.key]
+    for trigger in range(1, 10):
+        publisher.put(rejected(trigger))
+    until(lambda: len(arrived) == 10)
+    assert handled == []
+    go_on.set()
+    until(lambda: len(handled) == 10)
+    assert handled == [payload for _, payload in arrived]
+
+
 def test_an_exception_in_a_handler_becomes_the_buss_failure(client: Connect) -> None:
     bus, node, inbox = client(), client(), Inbox()
     failed = threading.Event()
