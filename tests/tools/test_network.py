@@ -9,6 +9,9 @@ import pytest
 from buddyline.protocol.divelog import DiveLogWriter
 from buddyline.protocol.messages import CameraModel, NodeInfo, NodePose
 from buddyline.tools.cli import main
+from msgspec.structs import replace
+
+from tests.tools import evaluated
 
 START_NS = 1_764_000_000_000_000_000
 STEP_NS = 100_000_000
@@ -162,6 +165,18 @@ def test_export_c3d_has_the_same_markers_as_trc(solved, tmp_path):
 def test_what_cannot_be_exported_is_said(solved, capsys, words, named):
     assert main(["export", solved, *words]) == 2
     assert named in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("form", ["tum", "csv"])
+def test_of_several_pairs_in_a_net_one_or_all_nodes_are_to_be_chosen(tmp_path, capsys, form):
+    pairs = [replace(evaluated.pose(0), node_a=one, node_b=two) for one, two in ("ab", "bc")]
+    log = write(tmp_path / "net.mcap", info("a"), info("b"), info("c"), *pairs, pose("b", 0, (1.0, 0.0, 0.0)))
+    assert main(["export", log, "--format", form]) == 2
+    said = "holds pairs a/b, b/c; choose one with --pair A/B, or all nodes with --what net"
+    assert said in capsys.readouterr().err
+    without = write(tmp_path / "pairs.mcap", info("a"), info("b"), info("c"), *pairs)
+    assert main(["export", without, "--format", form]) == 2
+    assert "--what net" not in capsys.readouterr().err
 
 
 def test_a_log_without_a_net_is_said(tmp_path, capsys):

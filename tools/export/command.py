@@ -14,6 +14,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Rejected, RelativePose, Track, Truth
 from buddyline.tools.columns import in_order, of_mode
 from buddyline.tools.evaluation.logs import load
+from buddyline.tools.evaluation.network import shows_network
 from buddyline.tools.evaluation.recorded import Recorded
 from buddyline.tools.evaluation.rotation import Floats
 from buddyline.tools.evaluation.truth import TruthTrack
@@ -76,13 +77,22 @@ def run(args: argparse.Namespace) -> int:
         return _export_file(args, form)
     if args.output is not None:
         check_new(args.output)
-    what, lines = _network_lines(args) if of_net else _lines(args, load(args.logs, pair=args.pair))
+    what, lines = _network_lines(args) if of_net else _lines(args, _of_pair(args))
     if args.output is None:
         sys.stdout.writelines(lines)
     else:
         write_new(args.output, "".join(lines))
     print(f"{', '.join(args.logs)}: {what}", file=sys.stderr)
     return 0
+
+
+def _of_pair(args: argparse.Namespace) -> Recorded:
+    try:
+        return load(args.logs, pair=args.pair)
+    except BuddylineError as error:
+        if args.pair is None and shows_network(args.logs):
+            raise BuddylineError(f"{error}, or all nodes with --what net") from error
+        raise
 
 
 def _lines(args: argparse.Namespace, recorded: Recorded) -> tuple[str, Iterator[str]]:
