@@ -86,6 +86,7 @@ def test_a_misread_tape_is_named_and_stands_out_in_the_residuals(tmp_path):
     rows = list(csv.DictReader(io.StringIO(tables.residuals_csv(Sheet(Project(), adjusted)))))
     of_tapes = [row for row in rows if row["observation"] == "distance"]
     assert len(of_tapes) == 15
+    assert {row["unit"] for row in rows if row["leg"]} == {"m"}
     assert max(of_tapes, key=lambda row: abs(float(row["w"])))["leg"] == "1-4"
     assert sum(float(row["redundancy"]) for row in rows) == pytest.approx(adjusted.fit.freedom, abs=0.01)
 
@@ -118,4 +119,5 @@ def test_the_example_site_is_adjusted(capsys):
     args = parser.parse_args(["adjust", str(REPOSITORY / "examples" / "datums" / "site.toml")])
     assert command.run(args) == 0
     assert "15 legs" in (said := capsys.readouterr().out)
+    assert "declination: no bearing was read" in said
     assert re.search(r"adjustment: 6 observations more than needed; all agree .*\(chi2 .*, variance factor .*\)", said)

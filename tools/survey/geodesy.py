@@ -141,7 +141,8 @@ def declination(project: Project) -> Declination | None:
         return Declination(source, math.radians(place.declination_deg))
     magnetic = [leg for leg in project.leg + project.point if leg.turn_deg is leg.declination_deg is UNSET]
     if not magnetic and project.leg:
-        return Declination("stated with the old surveys", 0.0)
+        read = any(leg.azimuth_deg is not UNSET or leg.back_azimuth_deg is not UNSET for leg in project.leg)
+        return Declination("stated with the old surveys" if read else "no bearing was read", 0.0)
     where = _somewhere(project)
     if where is None:
         return None

@@ -13,7 +13,7 @@ from buddyline.tools.measure.tables import csv_lines
 from buddyline.tools.survey.connected import station_depths
 from buddyline.tools.survey.fit import detectable
 from buddyline.tools.survey.geodesy import leg_date
-from buddyline.tools.survey.observations import CHECKED
+from buddyline.tools.survey.observations import CHECKED, KINDS
 from buddyline.tools.survey.old.model import CrossSection
 from buddyline.tools.survey.project import Leg
 from buddyline.tools.survey.sheet import Reading, Sheet
@@ -67,8 +67,8 @@ def legs_csv(sheet: Sheet) -> str:
 def residuals_csv(sheet: Sheet) -> str:
     """Return every observation's residual: what it is of, its value less the adjusted one, and how well it is checked.
 
-    In metres and degrees, as the unit says. redundancy: share of an error that shows; w: residual over its own sd,
-    empty where nothing checks it.
+    In metres and degrees, as the unit says; what is known of an instrument beforehand has none. redundancy: share of an
+    error that shows; w: residual over its own sd, empty where nothing checks it.
     """
     solution = sheet.adjusted.solution
     of, model, r = solution.observations, solution.model, solution.redundancies
@@ -84,7 +84,7 @@ def residuals_csv(sheet: Sheet) -> str:
             {
                 "leg": sheet.adjusted.survey.legs[leg].name if leg >= 0 else "",
                 "observation": what,
-                "unit": "deg" if angle else "",
+                "unit": "deg" if angle else "m" if leg >= 0 or model.kind[row] != KINDS["number"] else "",
                 "residual": f"{residual:z.4f}",
                 "sigma": f"{sigma:.4f}",
                 "redundancy": f"{r[row]:.3f}",
