@@ -125,7 +125,7 @@ def test_csv_of_a_track_equals_the_log(tracked, capsys):
     rows, log = tracked
     assert main(["export", log, "--format", "csv"]) == 0
     captured = capsys.readouterr()
-    assert captured.err.splitlines() == [f"{log}: the track (smooth), 3 rows; --what poses gives the poses"]
+    assert captured.err.splitlines() == [f"{log}: the track (smooth), 3 rows; `export --what poses` gives the poses"]
     found = list(csv.DictReader(io.StringIO(captured.out)))
     axes = ("x", "y", "z", "wx", "wy", "wz")
     for row, one in zip(found, sorted(rows, key=lambda one: one.stamp_ns), strict=True):

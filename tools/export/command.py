@@ -115,7 +115,7 @@ def chosen(recorded: Recorded, what: str | None, name: str) -> tuple[str, list[R
     if what == "track" and not track:
         raise BuddylineError(f"{name}: no track in it; solve it: buddyline solve DIVE.mcap -o OUT.mcap")
     if track:
-        other = "; --what poses gives the poses" if what is None and recorded.poses else ""
+        other = "; `export --what poses` gives the poses" if what is None and recorded.poses else ""
         return f"the track ({track[0].mode}), {len(track)} rows{other}", track
     if not recorded.poses:
         raise BuddylineError(f"{name}: {NO_POSES}")
