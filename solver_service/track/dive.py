@@ -18,9 +18,11 @@ from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, Stamps, TrackNode
 from buddyline.solver_service.track.output import TrackRow
+from buddyline.solver_service.track.relax import PathFilter
+from buddyline.solver_service.track.search import FURTHEST_M
 from buddyline.solver_service.track.smoother import Path, rows_between, smoothed
 from buddyline.solver_service.track.start import CLOCK_S, broad_start
-from buddyline.solver_service.track.state import CLOCK, NAV
+from buddyline.solver_service.track.state import CLOCK, NAV, R_
 from buddyline.solver_service.track.stepping import KNOWN_CLOCK_S
 from buddyline.solver_service.track.trail import Trail
 from buddyline.solver_service.track.vibration import Shares, fast_part, sudden_turn
@@ -46,6 +48,13 @@ CLOCK_TRIES_S: Final = (0.4, -0.4, 0.8, -0.8)
 NEARLY_ALL: Final = 0.9
 PIECES_S: Final = 0.1
 PIECES_SIGMAS: Final = 4.0
+# A track that began with single lamps is passed over so often at most, until a pass moves no pose by so many sigmas. It
+# is one where chi^2 of each residual is below UNFIT, on average, and it takes LEAST_TOLD of the lights of the first.
+LONE_PASSES: Final = 12
+STAYS_SIGMAS: Final = 0.3
+LOOKED_AT: Final = 10
+UNFIT: Final = 1.5
+LEAST_TOLD: Final = 0.5
 # Two quartz clocks drift apart by less, s a second.
 MOST_DRIFT: Final = 100e-6
 HEAD_NS: Final = 90 * S_NS
@@ -201,6 +210,10 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
     shift_s = learned.state.clock_s if learned.covariance[CLOCK, CLOCK] < KNOWN_CLOCK_S**2 else 0.0
     clock_sigma_s = CLOCK_LEFT_S + 3.0 * math.sqrt(learned.covariance[CLOCK, CLOCK])
     shares = reduce(Shares.plus, [part.shares for part in parts]).best()
+    if all(part.lone for part in parts):
+        return _of_one_lamp_each(records, clock_ns, max(parts, key=_lasted_s), shares, outputs_ns)
+    # Beside a track of any other start these are not linear enough for the pass below.
+    parts = [part for part in parts if not part.lone]
     walking = joint([part.walking for part in parts])
     told = sum(part.told for part in parts)
     unrest = min(max(math.sqrt(sum(part.surprise for part in parts) / told), 0.3), 2.0) if told > 100 else None
@@ -231,6 +244,50 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
             return _smoothed(second, found, outputs_ns)
     said = f"{second.both}: the second pass contradicts the first on the clocks, so it has diverged: no track"
     return Smoothed([], clock_ns * 1e-9, math.inf, [*second.problems, said])
+
+
+def _of_one_lamp_each(
+    records: Records, clock_ns: int, part: Estimate, shares: Floats, outputs_ns: Sequence[int]
+) -> Smoothed:
+    """Give the track that began with one lamp of each node, the dive's beginning with it if that settles, too."""
+    path, shaking = smoothed(part.steps), part.shaking.less(shares)
+    least, part.steps = LEAST_TOLD * sum(part.told_by), Trail()
+
+    def settled(path: Path, detection: Floats) -> tuple[PathFilter, Path] | None:
+        """Pass over the dive about the last pass's path until that does not move."""
+        for _ in range(LONE_PASSES):
+            track = PathFilter((records[0].node, records[1].node), path, detection, shaking)
+            track.clock_ns = clock_ns
+            track.take_off(shares)
+            pass_over(track, records, ())
+            found = track.passed
+            old, path, detection = path, smoothed(found.steps, path), found.detection
+            if not bool(np.isfinite(path.states).all()):
+                return None
+            if _stays(old, path):
+                fits = found.surprise < UNFIT * found.told and sum(found.told_by) > least
+                near = np.linalg.norm(path.states[:, R_], axis=1).max() < FURTHEST_M
+                return (track, path) if fits and near else None
+        return None
+
+    found = settled(path, part.detection)
+    if found is None:
+        said = f"nodes {records[0].node.name} and {records[1].node.name}: one lamp of each does not tell a track"
+        return Smoothed([], clock_ns * 1e-9, math.inf, [said])
+    track, path = found
+    earlier = _path_before(records, clock_ns, path, -math.inf, shares)
+    if earlier is not None:
+        track, path = settled(path.after(earlier), track.passed.detection) or found
+    return _rows_of(track, [path], outputs_ns)
+
+
+def _stays(old: Path, new: Path) -> bool:
+    """Whether a pass over a dive has left each pose where the pass before had it, by its covariance."""
+    for k in range(0, len(new), LOOKED_AT):
+        moved = new.state(k).minus(old.state(k))[:NAV]
+        if not moved @ np.linalg.solve(new.covariance(k)[:NAV, :NAV], moved) < NAV * STAYS_SIGMAS**2:
+            return False
+    return True
 
 
 def _path_before(records: Records, clock_ns: int, path: Path, since_s: float, shares: Floats) -> Path | None:
@@ -386,6 +443,11 @@ def _smoothed(track: TrackFilter, parts: Sequence[Estimate], outputs_ns: Sequenc
     for part in parts:
         paths.append(smoothed(part.steps))
         part.steps = Trail()
+    return _rows_of(track, paths, outputs_ns)
+
+
+def _rows_of(track: TrackFilter, paths: Sequence[Path], outputs_ns: Sequence[int]) -> Smoothed:
+    """Give the rows of a last pass's paths."""
     if not paths:
         return Smoothed([], track.clock_ns * 1e-9, math.inf, track.problems)
     stamps = sorted(outputs_ns)

@@ -42,10 +42,11 @@ class Estimate:
     estimate's at the start. surprise, told: chi^2 of the lights used, and of how many residuals. agreed_s: when a fix
     last agreed with it, inf where none did; agreed: how many did; contradicted: how many since then did not.
 
-    Its life: searched: it started without a fix. skip_s: pictures within this after start_s made it, and tell nothing
+    Its life: searched: it started without a fix; lone: from single lamps.
+    skip_s: pictures within this after start_s made it, and tell nothing
     new. patience_s: how long it may stay unconfirmed. end_s: later pictures are not its own. course: the evidence over
     time, used: the lights of each picture, by node and stamp; both while it is not confirmed. given: the lights to use
-    where that is decided.
+    where that is decided. saw: node of the lamps, time and last_seen of each picture while it is not confirmed.
     """
 
     t_s: float
@@ -76,6 +77,7 @@ class Estimate:
     patience_s: float = CHALLENGE_S
     unseen_by: int | None = None
     searched: bool = False
+    lone: bool = False
     bars: int = 0
     bar_s: float = -np.inf
     told_by: list[int] = field(default_factory=lambda: [0, 0])
@@ -91,6 +93,7 @@ class Estimate:
     given: dict[tuple[int, int], Chosen] = field(default_factory=dict)
     course: list[tuple[float, float]] = field(default_factory=list)
     last_seen: Floats | None = None
+    saw: list[tuple[int, float, Floats]] = field(default_factory=list)
 
     @property
     def lights(self) -> int:
@@ -99,7 +102,7 @@ class Estimate:
 
     def copied(self, **changes: object) -> Estimate:
         """Give an estimate that goes its own way from here."""
-        lists = ("evidence_by", "trigger", "attitude_s", "told_by", "missed", "without", "turning_off", "course")
+        lists = ("evidence_by", "trigger", "attitude_s", "told_by", "missed", "without", "turning_off", "course", "saw")
         own: dict[str, object] = {name: list(getattr(self, name)) for name in lists}
         own |= {"detection": self.detection.copy(), "steps": self.steps.copy(), "used": dict(self.used)}
         return replace(self, **(own | changes))  # type: ignore[arg-type]

@@ -34,6 +34,8 @@ GIVEN_UP: Final = -15.0
 # a second another's lamp fits in place of a hidden one, until the motion contradicts.
 BARS: Final = 4
 TOLD: Final = 12
+# A start from single lamps, when its place is known to this share of the range, 1 sd.
+LONE_SHARE: Final = 0.1
 # So many fixes must agree with a start from one of them, to confirm it, and to replace a confirmed track by it.
 FIXES_TO_CONFIRM: Final = 2
 FIXES_TO_REPLACE: Final = 3
@@ -183,13 +185,15 @@ class TrackFilter(TrackPool):
             if t_s >= estimate.t_s and t_s > estimate.start_s + estimate.skip_s and t_s < estimate.end_s:
                 if estimate.unseen_by == sight.node and not estimate.confirmed:
                     self._fork(estimate, t_s, sight)
-                self._step(estimate, t_s, sight)
                 if not estimate.confirmed:
-                    estimate.course.append((t_s, estimate.evidence))
-                elif estimate is self.main and estimate.last_seen is not None:
+                    self._follow(estimate, t_s, sight)
+                    continue
+                self._step(estimate, t_s, sight)
+                if estimate is self.main and estimate.last_seen is not None:
                     self.lamps.take(1 - sight.node, t_s, estimate.last_seen)
         self._judge(t_s)
         self._search(t_s, sight)
+        self._search_window(t_s)
 
     def _take_fix(self, t_s: float, fix: FixSeen) -> None:
         if not self.restarts:
@@ -301,9 +305,8 @@ class TrackFilter(TrackPool):
                         main.end_s = min(challenger.start_s, main.agreed_s)
                         main.steps.drop_after(main.end_s)
                         self.finished.append(main)
-                    self.main = self._again(challenger)
+                    self._confirm(challenger)
                     self.challengers = []
-                    self.main.confirmed = True
                     return
             recent = [one for one in self.challengers if t_s - one.start_s < one.patience_s]
             self.challengers = self._thinned(t_s, recent)
@@ -328,8 +331,14 @@ class TrackFilter(TrackPool):
             for rival in self.challengers:
                 # A rival goes on as a challenger: what it is to explain better is what came since both exist.
                 rival.baseline = best.evidence - rival.evidence + lead(rival, best)
-            self.main = self._again(best)
-            self.main.confirmed = True
+            self._confirm(best)
+
+    def _confirm(self, estimate: Estimate) -> None:
+        self.main = self._again(estimate)
+        self.main.confirmed = True
+        # Others are replayed, which tells which lamps are dark.
+        for node, t_s, seen in estimate.saw if estimate.lone else ():
+            self.lamps.take(node, t_s, seen)
 
     @staticmethod
     def _thinned(t_s: float, pool: list[Estimate]) -> list[Estimate]:
@@ -356,13 +365,17 @@ class TrackFilter(TrackPool):
         a single fix may be wrong, by chance or by another's lamp. A start without a fix may be of false candidates, or
         of a third node's bar: it needs pictures with both lights, and of both nodes.
         """
+        if estimate.lone:
+            place = place_covariance(estimate.state, estimate.covariance)
+            share = math.sqrt(np.trace(place)) / float(np.linalg.norm(estimate.state.r_m))
+            return min(estimate.told_by) >= TOLD and share < LONE_SHARE
         if estimate.searched:
             return estimate.bars >= BARS and min(estimate.told_by) >= TOLD
         return estimate.agreed >= fixes or min(estimate.bars, *estimate.told_by) >= bars
 
     def _again(self, estimate: Estimate) -> Estimate:
         """Give an estimate as it is to be followed once confirmed: replayed, if it started without a fix."""
-        if not estimate.searched or any(estimate.without):
+        if not estimate.searched or estimate.lone or any(estimate.without):
             return estimate
         return self._replayed(estimate)
 

@@ -21,6 +21,7 @@ from buddyline.solver_service.track.start import CLOCK_S, constants_of
 from buddyline.solver_service.track.state import PHI, R_, State, of_place, place_covariance
 from buddyline.solver_service.track.stepping import HOLD_S, TICK_S, TrackSteps
 from buddyline.solver_service.track.trail import Chosen, Trail
+from buddyline.solver_service.track.window import fits, gathered, state_of
 
 # A start without a fix: how often one is tried, how long after the last fix, for how long it and how many are kept.
 SEARCH_EVERY_S: Final = 0.45
@@ -32,6 +33,12 @@ MAX_TENTATIVE: Final = 24
 ONE_SIDED: Final = 30
 # Pictures are kept for so long, and since the start of each estimate without a fix that is followed: for its replay.
 SIGHTS_S: Final = 2.0
+# A start from single lamps looks at so many seconds, so often; each of their lamps is found so likely, any other so.
+WINDOW_S: Final = 14.0
+LEAST_WINDOW_S: Final = 13.5
+WINDOW_EVERY_S: Final = 3.0
+LIT: Final = 0.9
+UNLIT: Final = 0.05
 # The noise of the lights that a start is made of: one in thirty is off by many pixels.
 START_PX: Final = 2.5
 # A replay starts with these sigmas: a share of the range, rad, or so many of the learned sigmas where that is more.
@@ -55,7 +62,7 @@ class TrackPool(TrackSteps):
         self.restarts = self.searches = True
         self.lamps = LampWatch()
         self._sights: deque[tuple[float, Sight]] = deque()
-        self._searched_s, self._searched_of = -np.inf, 1
+        self._searched_s, self._searched_of, self._windowed_s = -np.inf, 1, -np.inf
         self._fix_s = -np.inf
 
     def _estimates(self) -> list[Estimate]:
@@ -65,7 +72,8 @@ class TrackPool(TrackSteps):
         """Keep the pictures that a start may be replayed with."""
         self._sights.append((t_s, sight))
         followed_s = [one.start_s for one in self._estimates() if one.searched and not one.confirmed]
-        while self._sights[0][0] < min([t_s - SIGHTS_S, *followed_s]):
+        span_s = SIGHTS_S if self.main and self.main.confirmed else WINDOW_S
+        while self._sights[0][0] < min([t_s - span_s, *followed_s]):
             self._sights.popleft()
 
     def _replayed(self, estimate: Estimate) -> Estimate:
@@ -182,6 +190,58 @@ class TrackPool(TrackSteps):
                 estimate.detection = self.main.detection.copy()
             self._open(estimate)
             self.challengers.append(estimate)
+
+    def _search_window(self, t_s: float) -> None:
+        """Start from single lamps, where nothing is confirmed for long; of a whole dive only.
+
+        Such a start is linear enough only when the whole dive is passed over again and again.
+        """
+        since_s = max(t_s - WINDOW_S, self._sights[0][0] - 0.001)
+        followed = self.main is not None and self.main.confirmed
+        if (
+            followed
+            or not (self.restarts and self.searches)
+            or t_s - since_s < LEAST_WINDOW_S
+            or math.isfinite(self._keep_s)
+        ):
+            return
+        if t_s - self._fix_s < SEARCH_AFTER_S or t_s - self._windowed_s < WINDOW_EVERY_S:
+            return
+        self._windowed_s = t_s
+        sights = [sight for at_s, sight in self._sights if at_s > since_s]
+        window = gathered(self.nodes, self.samples, self.attitudes, self.depths, sights, since_s)
+        if window is None:
+            return
+        pool = [one for one in self._estimates() if not one.lone]
+        try:
+            found = [(fit, *state_of(window, fit, self.clock_sigma_s)) for fit in fits(window)]
+        except np.linalg.LinAlgError:
+            return
+        for fit, state, P in found:
+            estimate = Estimate(
+                since_s,
+                state,
+                P,
+                since_s,
+                patience_s=WINDOW_S + SEARCH_PATIENCE_S,
+                searched=True,
+                lone=True,
+                detection=np.full((2, 2), UNLIT),
+            )
+            for node in (0, 1):
+                estimate.detection[node, fit.seen[node][0, 2]] = LIT
+            self._open(estimate)
+            for sight in sights:
+                self._follow(estimate, sight.t_s, sight)
+            pool.append(estimate)
+        self.main, self.challengers = None, pool
+
+    def _follow(self, estimate: Estimate, t_s: float, sight: Sight) -> None:
+        """Bring an estimate that is not confirmed to a picture."""
+        self._step(estimate, t_s, sight)
+        estimate.course.append((t_s, estimate.evidence))
+        if estimate.last_seen is not None:
+            estimate.saw.append((1 - sight.node, t_s, estimate.last_seen))
 
     def _fork(self, estimate: Estimate, t_s: float, sight: Sight) -> None:
         """Follow each candidate of the node that has not yet told anything as each light, as estimates of their own."""

@@ -51,6 +51,12 @@ class Path:
         """Return the number of steps."""
         return len(self.t_s)
 
+    def after(self, earlier: Path) -> Path:
+        """Give this path with an earlier one before it, whose last step is its first."""
+        columns = ("t_s", "light_s", "lights", "rates_radps", "states", "halves", "drawn", "without")
+        both = {name: np.concatenate((getattr(earlier, name)[:-1], getattr(self, name))) for name in columns}
+        return Path(**both, looks=[*earlier.looks[:-1], *self.looks], oldest=earlier.oldest)
+
     def state(self, k: int) -> State:
         """Give the state at a step."""
         return State.of_row(self.states[k])
@@ -71,11 +77,12 @@ class Path:
         return P
 
 
-def smoothed(steps: Trail) -> Path:
+def smoothed(steps: Trail, about: Path | None = None) -> Path:
     """Give the state and covariance of each step by all steps' measurements.
 
     Backward, C = P F^T (P-)^-1 with P- = F P F^T + Q; the state is off its filtered one by C (x+1 - x-), its covariance
-    P + C (P+1 - P-) C^T.
+    P + C (P+1 - P-) C^T. about: the path that these steps are linear about: errors are then taken against it, where
+    they add up exactly.
     """
     count = len(steps)
     looks: list[tuple[Look, ...]] = [()] * count
@@ -100,10 +107,14 @@ def smoothed(steps: Trail) -> Path:
             across = step.covariance.copy()
             across[:, :MOVING] = step.covariance @ later.F.T
             gain = np.linalg.solve(P_before, across.T).T
-            error = gain @ state.minus(later.before)
+            if about is None:
+                state = step.after.plus(gain @ state.minus(later.before))
+            else:
+                there, then = about.state(k), about.state(k + 1)
+                error = gain @ (state.minus(then) - later.before.minus(then))
+                state = there.plus(step.after.minus(there) + error)
             P = step.covariance + gain @ (P - P_before) @ gain.T
             P = 0.5 * (P + P.T)
-            state = step.after.plus(error)
         path.t_s[k], path.light_s[k], path.lights[k] = step.t_s, step.light_s, step.lights
         path.states[k], path.halves[k] = state.to_row(), P[_BLOCK_UPPER]
         path.drawn[k], path.without[k] = _drawn(step.Q)

@@ -133,3 +133,13 @@ def test_twenty_dives_with_a_dark_lamp() -> None:
         judged.append(simulated(scenario, 40.0))
     assert sum(wrong for wrong, _ in judged) == 0
     assert min(share for _, share in judged) > 0.95
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("environment", "seed", "dead"), [(1, 3001, ("b.left", "a.right"))])
+def test_one_lamp_each_is_enough_for_a_whole_dive(environment: int, seed: int, dead: tuple[str, str]) -> None:
+    """Nothing tells the range in any one picture, nor which lamps are lit."""
+    scenario = Scenario(ENVIRONMENTS[environment], seed=seed, start_ns=EPOCH_NS, inertial="poor", dead_lamps=dead)
+    wrong, share = simulated(scenario, 40.0)
+    assert wrong == 0
+    assert share > 0.8

@@ -1,0 +1,64 @@
+"""Passes about a path: they end where the dive says, not where the path was; one lamp of each node is enough."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.track.dive import parts_of, pass_over, smooth
+from buddyline.solver_service.track.relax import PathFilter
+from buddyline.solver_service.track.shaking import Shaking
+from buddyline.solver_service.track.smoother import Path, smoothed
+from buddyline.solver_service.track.state import NAV, PHI, R_, SIZE
+
+from tests.solver_service.track.dives import KnownDive, Setting, filter_of, make, score
+
+
+def passed_about(dive: KnownDive, path: Path) -> Path:
+    a, b = dive.records
+    track = PathFilter((a.node, b.node), path, np.full((2, 2), 0.9), Shaking())
+    pass_over(track, dive.records, ())
+    return smoothed(track.passed.steps, path)
+
+
+def off_by(path: Path, error: Floats) -> Path:
+    """A path that is off, says so, and has used no light."""
+    states = np.stack([path.state(k).plus(error).to_row() for k in range(len(path))])
+    looks = [tuple(replace(look, chosen=()) for look in of_step) for of_step in path.looks]
+    return replace(path, states=states, halves=1e3 * path.halves, looks=looks)
+
+
+def moved(old: Path, new: Path) -> float:
+    """The mean chi^2 of a pose's twelve errors from one path to another, over twelve."""
+    errors = [new.state(k).minus(old.state(k))[:NAV] for k in range(len(new))]
+    covariances = [new.covariance(k)[:NAV, :NAV] for k in range(len(new))]
+    chi2 = [error @ np.linalg.solve(P, error) for error, P in zip(errors, covariances, strict=True)]
+    return float(np.mean(chi2)) / NAV
+
+
+def test_passes_about_a_path_that_is_off_end_at_the_same_path() -> None:
+    dive = make(5, Setting(seconds=6.0, false=0))
+    first = filter_of(dive.records, dive.fixes)
+    pass_over(first, dive.records, dive.fixes)
+    right = passed_about(dive, passed_about(dive, smoothed(parts_of(first)[0].steps)))
+    error = np.zeros(SIZE)
+    error[R_] = 0.05 * right.state(0).r_m
+    error[PHI[0]] = error[PHI[1]] = (0.0, 0.0, 0.1)
+    error[PHI[1]] += (0.02, 0.0, -0.02)
+    path = off_by(right, error)
+    for _ in range(3):
+        path = passed_about(dive, path)
+    assert moved(path, right) < 0.01
+
+
+@pytest.mark.slow
+def test_a_dive_with_one_lamp_of_each_node_has_a_track() -> None:
+    """Nothing tells the range in any one picture, nor which lamps are lit."""
+    setting = Setting(seconds=24.0, poor=True)
+    dive = make(6, replace(setting, dead=((0, 1), (1, 1))))
+    smooth_track = smooth(dive.records, (), dive.stamps_ns)
+    judged = score(replace(dive, fixes=make(6, setting).fixes), smooth_track.rows)
+    assert judged.covered > 0.5
+    assert judged.wrong == 0
+    assert judged.nees < 3.0
+    assert {(node, light) for node, light, _ in smooth_track.dark} == {(0, 1), (1, 1)}
