@@ -20,6 +20,7 @@ from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSe
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.relax import PathFilter
 from buddyline.solver_service.track.search import FURTHEST_M
+from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.smoother import Path, rows_between, smoothed
 from buddyline.solver_service.track.start import CLOCK_S, broad_start
 from buddyline.solver_service.track.state import CLOCK, NAV, R_
@@ -37,6 +38,8 @@ CLOCK_WITHOUT_S: Final = 0.003
 NEAR_CLOCK_S: Final = 0.005
 MOST_LEFT_S: Final = 0.06
 CLOCK_ROUNDS: Final = 4
+# A track that began without a fix, and is carried back by more than this, is passed over until that settles.
+LATE_S: Final = 2.0
 # A track whose start is so near to the dive's is left as it is.
 LEAST_EARLIER_S: Final = 0.15
 # An offset differs from the assumed one where it is so many sigmas off.
@@ -48,8 +51,9 @@ CLOCK_TRIES_S: Final = (0.4, -0.4, 0.8, -0.8)
 NEARLY_ALL: Final = 0.9
 PIECES_S: Final = 0.1
 PIECES_SIGMAS: Final = 4.0
-# A track that began with single lamps is passed over so often at most, until a pass moves no pose by so many sigmas. It
-# is one where chi^2 of each residual is below UNFIT, on average, and it takes LEAST_TOLD of the lights of the first.
+# A track that began with single lamps, or so late, is passed over so often at most, until a pass moves no pose by so
+# many sigmas. It is one where chi^2 of each residual is below UNFIT, on average, and it takes LEAST_TOLD of the lights
+# of the first.
 LONE_PASSES: Final = 12
 STAYS_SIGMAS: Final = 0.3
 LOOKED_AT: Final = 10
@@ -218,6 +222,16 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
     told = sum(part.told for part in parts)
     unrest = min(max(math.sqrt(sum(part.surprise for part in parts) / told), 0.3), 2.0) if told > 100 else None
     paths = [(smoothed(part.steps), part.end_s, part.shaking.less(shares)) for part in parts]
+    if len(parts) == 1 and parts[0].searched and not parts[0].agreed:
+        [(path, _, shaking)] = paths
+        earlier = _path_before(records, clock_ns, path, -math.inf, shares)
+        # So far from the start, a path that is carried back is too far off for the one pass below to be linear.
+        if earlier is not None and path.t_s[0] - earlier.t_s[0] > LATE_S:
+            parts[0].steps = Trail()
+            about = (path.after(earlier), parts[0].detection, sum(parts[0].told_by))
+            settled = _settled(*about, records, clock_ns, shaking, shares)
+            if settled is not None:
+                return _rows_of(settled[0], [settled[1]], outputs_ns)
     # Every step of the first pass holds a covariance: both passes at once take twice the memory.
     del first, parts, learned
     # Where the dive's beginning, before the first start, leads the second pass astray, it is left out.
@@ -250,35 +264,37 @@ def _of_one_lamp_each(
     records: Records, clock_ns: int, part: Estimate, shares: Floats, outputs_ns: Sequence[int]
 ) -> Smoothed:
     """Give the track that began with one lamp of each node, the dive's beginning with it if that settles, too."""
-    path, shaking = smoothed(part.steps), part.shaking.less(shares)
-    least, part.steps = LEAST_TOLD * sum(part.told_by), Trail()
-
-    def settled(path: Path, detection: Floats) -> tuple[PathFilter, Path] | None:
-        """Pass over the dive about the last pass's path until that does not move."""
-        for _ in range(LONE_PASSES):
-            track = PathFilter((records[0].node, records[1].node), path, detection, shaking)
-            track.clock_ns = clock_ns
-            track.take_off(shares)
-            pass_over(track, records, ())
-            found = track.passed
-            old, path, detection = path, smoothed(found.steps, path), found.detection
-            if not bool(np.isfinite(path.states).all()):
-                return None
-            if _stays(old, path):
-                fits = found.surprise < UNFIT * found.told and sum(found.told_by) > least
-                near = np.linalg.norm(path.states[:, R_], axis=1).max() < FURTHEST_M
-                return (track, path) if fits and near else None
-        return None
-
-    found = settled(path, part.detection)
+    path, told, about = smoothed(part.steps), sum(part.told_by), (records, clock_ns, part.shaking.less(shares), shares)
+    part.steps = Trail()
+    found = _settled(path, part.detection, told, *about)
     if found is None:
         said = f"nodes {records[0].node.name} and {records[1].node.name}: one lamp of each does not tell a track"
         return Smoothed([], clock_ns * 1e-9, math.inf, [said])
     track, path = found
     earlier = _path_before(records, clock_ns, path, -math.inf, shares)
     if earlier is not None:
-        track, path = settled(path.after(earlier), track.passed.detection) or found
+        track, path = _settled(path.after(earlier), track.passed.detection, told, *about) or found
     return _rows_of(track, [path], outputs_ns)
+
+
+def _settled(
+    path: Path, detection: Floats, told: int, records: Records, clock_ns: int, shaking: Shaking, shares: Floats
+) -> tuple[PathFilter, Path] | None:
+    """Pass over a dive about the last pass's path until that does not move. told: the pictures that the first used."""
+    for _ in range(LONE_PASSES):
+        track = PathFilter((records[0].node, records[1].node), path, detection, shaking)
+        track.clock_ns = clock_ns
+        track.take_off(shares)
+        pass_over(track, records, ())
+        found = track.passed
+        old, path, detection = path, smoothed(found.steps, path), found.detection
+        if not bool(np.isfinite(path.states).all()):
+            return None
+        if _stays(old, path):
+            fits = found.surprise < UNFIT * found.told and sum(found.told_by) > LEAST_TOLD * told
+            near = np.linalg.norm(path.states[:, R_], axis=1).max() < FURTHEST_M
+            return (track, path) if fits and near else None
+    return None
 
 
 def _stays(old: Path, new: Path) -> bool:
