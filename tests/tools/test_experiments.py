@@ -89,7 +89,12 @@ def test_a_quick_run_writes_a_report_that_needs_nothing_else(tmp_path, capsys):
     assert found["near"]["ours"] == 1.0
     assert all(0.5 < row["rms_ratio"] < 1.6 for row in found["bound"])
     assert found["time"]["eq1_ms"] < found["time"]["trigger"]["median_ms"]
+    four, basin = found["networks"].values()
+    assert [[node["node"] for node in net] for net in (four, basin)] == [["a", "b", "c", "d"], ["a", "b", "c"]]
+    assert sum(node["wrong"] for node in [*four, *basin]) == 0
+    assert all(node["position_m"]["median"] < 0.01 for node in basin)
     html = (folder / "report.html").read_text()
+    assert "a basin at 20 Hz" in html
     assert html.count("data:image/png;base64,") >= 7
     assert not re.search(r'(src|href)="(?!data:)', html)
     assert (folder / "headline.md").read_text().count("\n") >= 8

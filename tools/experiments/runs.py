@@ -13,6 +13,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.cli import command_named
 from buddyline.tools.dives import Dive
 from buddyline.tools.evaluation.logs import load_for_evaluation
+from buddyline.tools.evaluation.network import NodeFigures, load_network, network_figures
 from buddyline.tools.evaluation.result import Result, evaluate
 
 ENVIRONMENTS: Final = ("cavern", "night_reef", "lake", "basin")
@@ -33,6 +34,15 @@ _SOLVES: Final[Mapping[str, tuple[str, str, str]]] = {
 }
 """Detector, method and checks of each. The paper checks the range gap and, with sensors, attitude and depth."""
 
+NETS: Final[Mapping[str, tuple[str, ...]]] = {
+    "four nodes at 10 Hz, a on a tripod": ("--nodes", "4", "--fixed", "a", "--rate", "10"),
+    "a basin at 20 Hz, a and c on tripods": (
+        *("--nodes", "3", "--fixed", "a", "--fixed", "c", "--rate", "20"),
+        *("--environment", "basin", "--range-max", "6"),
+    ),
+}
+"""Dives of more than two nodes, all with inertial units, and what `simulate` is told for them."""
+
 _LONG_METHODS: Final = {OURS: "refined", "paper's": "paper", "paper's text, literally": "paper_literal"}
 
 
@@ -40,18 +50,19 @@ _LONG_METHODS: Final = {OURS: "refined", "paper's": "paper", "paper's text, lite
 class Size:
     """The lengths of the simulated dives. seconds, rate_hz: of each rendered dive. long_*: of the dive out to 20 m.
 
-    tank_step: every tank_step-th picture of the tank's video is used.
+    net_seconds: of those of more than two nodes. tank_step: every tank_step-th picture of the tank's video is used.
     """
 
     seconds: float
     rate_hz: float
     long_seconds: float
     long_rate_hz: float
+    net_seconds: float
     tank_step: int
 
 
-FULL: Final = Size(seconds=60.0, rate_hz=2.0, long_seconds=240.0, long_rate_hz=4.0, tank_step=5)
-QUICK: Final = Size(seconds=8.0, rate_hz=2.0, long_seconds=42.0, long_rate_hz=2.0, tank_step=80)
+FULL: Final = Size(seconds=60.0, rate_hz=2.0, long_seconds=240.0, long_rate_hz=4.0, net_seconds=20.0, tank_step=5)
+QUICK: Final = Size(seconds=8.0, rate_hz=2.0, long_seconds=42.0, long_rate_hz=2.0, net_seconds=5.0, tank_step=80)
 
 
 def call(name: str, *words: str) -> None:
@@ -115,3 +126,15 @@ def long_dive(size: Size, directory: Path) -> tuple[Path, dict[str, Result]]:
         call("solve", str(dive), "-o", str(out), "--method", method, "--checks", checks)
         results[name] = measured(out)
     return dive, results
+
+
+def net_dives(size: Size, directory: Path) -> dict[str, list[NodeFigures]]:
+    """Simulate and solve the dives of more than two nodes; return their nodes' figures in one frame."""
+    found = {}
+    for number, (name, words) in enumerate(NETS.items()):
+        dive, solved = directory / f"net{number}.mcap", directory / f"net{number}.solved.mcap"
+        seed = str(SEED + 20 + number)
+        call("simulate", str(dive), "--imu", "--seed", seed, "--seconds", str(size.net_seconds), *words)
+        call("solve", str(dive), "-o", str(solved))
+        found[name] = network_figures(*load_network([str(solved)], [str(dive)]))
+    return found
