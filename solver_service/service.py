@@ -57,12 +57,12 @@ WAIT_S: Final = 1.0
 OWED_S: Final = 10.0
 
 
-class _Frame(msgspec.Struct):
+class _FrameHead(msgspec.Struct):
     trigger: int
     stamp_ns: int
 
 
-_FRAME: Final = msgspec.json.Decoder(_Frame)
+_FRAME_HEAD: Final = msgspec.json.Decoder(_FrameHead)
 
 
 class SolverService(Service):
@@ -257,7 +257,7 @@ class SolverService(Service):
         if self._journal is not None and parsed is not None and parsed[0] is CANDIDATES:
             (node,) = parsed[1]
             with suppress(msgspec.DecodeError, UnicodeDecodeError):
-                frame = _FRAME.decode(payload)
+                frame = _FRAME_HEAD.decode(payload)
                 if frame.trigger in self._owed_triggers:
                     self._come_again.add((node, frame.trigger))
                 if frame.stamp_ns > self._answered_to_ns.get(node, -1):

@@ -47,7 +47,7 @@ BASIN = {"more_nodes": ("c",), "fixed_nodes": ("a", "c"), "environment": "basin"
 
 
 @dataclass
-class Run:
+class NetRun:
     """What one run told. joint: by time, where each node's place stands in the joint covariance (3 n, 3 n)."""
 
     poses: list[NodePose]
@@ -55,7 +55,7 @@ class Run:
 
 
 @dataclass
-class Errors:
+class NetErrors:
     """Of one node in one dive: squared errors of place (N,), their variance, turns, and errors over the covariance."""
 
     squared_m2: Floats
@@ -120,7 +120,7 @@ def told(grade: Grade) -> Iterator[None]:
         yield
 
 
-def solved(messages: Sequence[Message], mode: str, hz: float) -> Run:
+def solved(messages: Sequence[Message], mode: str, hz: float) -> NetRun:
     """Solve as a stored dive, without the pairs' tracks, and note the joint covariance of each row."""
     joint: dict[int, tuple[list[int], Floats]] = {}
 
@@ -160,10 +160,10 @@ def solved(messages: Sequence[Message], mode: str, hz: float) -> Run:
         found += core.flush()
         names = core.network.nodes if core.network is not None else []
     placed = {ns: ({names[node]: i for i, node in enumerate(nodes)}, P) for ns, (nodes, P) in joint.items()}
-    return Run([one for one in found if isinstance(one, NodePose)], placed)
+    return NetRun([one for one in found if isinstance(one, NodePose)], placed)
 
 
-def errors_of(world: World, run: Run) -> dict[str, Errors]:
+def errors_of(world: World, run: NetRun) -> dict[str, NetErrors]:
     """Give the errors of each node that moves."""
     rows: dict[str, list[tuple[float, float, float, float]]] = {}
     for pose in run.poses:
@@ -175,10 +175,10 @@ def errors_of(world: World, run: Run) -> dict[str, Errors]:
         P = np.array(pose.covariance).reshape(6, 6)
         one = float(e[:3] @ e[:3]), float(np.trace(P[:3, :3])), float(np.linalg.norm(turn))
         rows.setdefault(pose.node, []).append((*one, float(e @ np.linalg.solve(P, e)) / 6.0))
-    return {node: Errors(*np.array(found).T) for node, found in rows.items()}
+    return {node: NetErrors(*np.array(found).T) for node, found in rows.items()}
 
 
-def between(world: World, run: Run, one: str, two: str) -> dict[int, tuple[float, float, float]]:
+def between(world: World, run: NetRun, one: str, two: str) -> dict[int, tuple[float, float, float]]:
     """Give by time the squared error of the way from one node to another, its variance, and both places' together."""
     places = {(pose.node, pose.stamp_ns): np.array(pose.p_m) for pose in run.poses}
     found = {}
@@ -192,7 +192,7 @@ def between(world: World, run: Run, one: str, two: str) -> dict[int, tuple[float
     return found
 
 
-def compare(world: World, ours: Run, best: Run, nodes: tuple[str, str], figures: Figures) -> str:
+def compare(world: World, ours: NetRun, best: NetRun, nodes: tuple[str, str], figures: Figures) -> str:
     """Add one dive's figures, and return them as a line."""
     found, bound = errors_of(world, ours), errors_of(world, best)
     for name, run in (("place", found), ("told", bound)):

@@ -46,7 +46,7 @@ class Flaws:
 
 
 @dataclass
-class Course:
+class SurveyCourse:
     """Stations (n, 3), NED metres by magnetic north, and legs (from, to, rear node) by index, in order."""
 
     stations_m: np.ndarray
@@ -65,7 +65,7 @@ def line(rng, legs):
     for _ in range(legs):
         heading += rng.normal(0, 0.5)
         places.append(_next(rng, places[-1], heading, rng.uniform(3.0, 9.0)))
-    return Course(np.array(places), [(k, k + 1, k % 2) for k in range(legs)], [str(k) for k in range(legs + 1)])
+    return SurveyCourse(np.array(places), [(k, k + 1, k % 2) for k in range(legs)], [str(k) for k in range(legs + 1)])
 
 
 def _next(rng, place, heading, range_m):
@@ -88,7 +88,7 @@ def loop(rng, legs):
     places = np.column_stack([radii * np.cos(angles), radii * np.sin(angles), depth])
     steps = [(k, (k + 1) % legs, k % 2) for k in range(legs)]
     # The front node of the last leg closes the loop: it is at the first station.
-    return Course(places, steps, [str(k) for k in range(legs)], {(legs - 1, 1 - (legs - 1) % 2): "0"})
+    return SurveyCourse(places, steps, [str(k) for k in range(legs)], {(legs - 1, 1 - (legs - 1) % 2): "0"})
 
 
 class _Slow:

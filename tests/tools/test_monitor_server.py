@@ -21,7 +21,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Message, NodePose
 from buddyline.protocol.topics import key_of
 from buddyline.tools.monitor.coverage import Coverage
-from buddyline.tools.monitor.frames import Contents, Viewer, fields, scene
+from buddyline.tools.monitor.frames import PageContents, Viewer, fields, scene
 from buddyline.tools.monitor.live import LiveSession
 from buddyline.tools.monitor.overview import Overview
 from buddyline.tools.monitor.playback import Playback, cover
@@ -198,7 +198,7 @@ class TestFrames:
                 assert (banner["level"] == "ok") == ("All is well" in health), (step, banner)
 
     def test_what_is_shown_at_an_instant_is_made_once_for_all_who_look(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        overview, contents = filled(), dict[Pair | None, Contents]()
+        overview, contents = filled(), dict[Pair | None, PageContents]()
         made: list[int] = []
         monkeypatch.setattr("buddyline.tools.monitor.frames.scene", lambda *args: made.append(args[-1]) or scene(*args))
         viewers = [Viewer(live=True, contents=contents) for _ in range(5)]
@@ -222,7 +222,7 @@ class TestFrames:
         assert frame["pairs"]["shown"] == ["a", "c"]
 
     def test_who_comes_later_is_told_nothing_old(self) -> None:
-        overview, contents = filled(), dict[Pair | None, Contents]()
+        overview, contents = filled(), dict[Pair | None, PageContents]()
         left = Viewer(live=True, contents=contents)
         assert left.frame(overview, at(29))["banner"]["level"] == "ok"
         left.frame(overview, at(29) + 33_333_333)

@@ -206,7 +206,7 @@ def test_a_network_of_distances_alone_keeps_its_shape():
     rng = np.random.default_rng(2)
     datums_m = np.column_stack([rng.uniform(0, 12, (6, 2)), rng.uniform(8, 10, 6)])
     pairs = [(i, j, 0) for i in range(6) for j in range(i + 1, 6)]
-    course = world.Course(datums_m, pairs, [f"D{k}" for k in range(6)])
+    course = world.SurveyCourse(datums_m, pairs, [f"D{k}" for k in range(6)])
     legs = [
         replace(leg, azimuth_deg=UNSET, back_azimuth_deg=UNSET, inclination_deg=UNSET, back_inclination_deg=UNSET)
         for leg in world.readings_of(course, rng, tape_m=0.01, depth_m=0.01)

@@ -154,7 +154,7 @@ def test_a_point_without_fixes_is_reported(messages):
 def test_moving_round_a_fixed_node_keeps_its_station():
     rng = np.random.default_rng(4)
     places = np.array([[0.0, 0, 10], [5, 1, 9.0], [4, -3, 11.0], [6, 2, 10.2]])
-    course = world.Course(places, [(0, 1, 0), (0, 2, 0), (0, 3, 0)], ["0", "1", "2", "3"])
+    course = world.SurveyCourse(places, [(0, 1, 0), (0, 2, 0), (0, 3, 0)], ["0", "1", "2", "3"])
     found = derived(world.dive(course, rng, rest_s=6.0, swim_s=2.0), procedure="stay")
     assert [(leg.from_, leg.to) for leg in found.legs] == [("0", "1"), ("0", "2"), ("0", "3")]
 

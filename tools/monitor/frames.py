@@ -40,7 +40,7 @@ FRUSTUM_M: Final = 0.35
 Row = list[float | int | None]
 
 
-class Contents:
+class PageContents:
     """What is shown of a pair beside trail and plots: made once at an instant, for all who look at it then."""
 
     def __init__(self, *, live: bool) -> None:
@@ -86,7 +86,7 @@ class Viewer:
     contents: by pair, of all who look at the same overview; None: of this viewer alone.
     """
 
-    def __init__(self, *, live: bool, contents: dict[Pair | None, Contents] | None = None) -> None:
+    def __init__(self, *, live: bool, contents: dict[Pair | None, PageContents] | None = None) -> None:
         self.pair: Pair | None = None
         # The time of the last value told, by chosen field (`key field`).
         self._probed_ns: dict[str, int] = {}
@@ -114,7 +114,7 @@ class Viewer:
         if picture.pair != self._shown:
             self._shown = picture.pair
             self.restart()
-        contents = self._contents.setdefault(picture.pair, Contents(live=self._live))
+        contents = self._contents.setdefault(picture.pair, PageContents(live=self._live))
         contents.update(overview, picture, now_ns, anew=self._reset)
         said: dict[str, Any] = {"now": now_ns / MS_NS}
         if self._reset:

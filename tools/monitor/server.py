@@ -25,7 +25,7 @@ from urllib.parse import parse_qs, urlsplit
 import msgspec
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.extras import needed
-from buddyline.tools.monitor.frames import RATE_HZ, Contents, Viewer, fields
+from buddyline.tools.monitor.frames import RATE_HZ, PageContents, Viewer, fields
 
 if TYPE_CHECKING:
     from buddyline.tools.monitor.overview import Overview
@@ -145,7 +145,7 @@ class _Serving:
         self._server = server
         self._viewers = 0
         # Of running nodes, at which all look together.
-        self._contents: dict[Pair | None, Contents] = {}
+        self._contents: dict[Pair | None, PageContents] = {}
         self._packed: dict[str, tuple[bytes, bytes, str]] = {}
         files = resources.files("buddyline.tools.monitor") / "web"
         for path, (name, kind) in FILES.items():

@@ -75,7 +75,7 @@ class TagPose:
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
+class _TagFit:
     t_m: Floats
     q_xyzw: Floats
     squares_px2: float
@@ -105,7 +105,7 @@ def readings_of(
 def tag_pose(readings: Sequence[TagReading]) -> TagPose | None:
     """Return T_a_b from all readings that fit together; None if too few do, or two poses explain them."""
     best: list[TagReading] = []
-    best_fit: _Fit | None = None
+    best_fit: _TagFit | None = None
     everything = len({(reading.by_a, id(reading.points_m)) for reading in readings})
     for seed in readings:
         if len(best) == everything:
@@ -148,7 +148,7 @@ def tag_pose(readings: Sequence[TagReading]) -> TagPose | None:
     )
 
 
-def _mean(fit: _Fit, chosen: Sequence[TagReading]) -> float:
+def _mean(fit: _TagFit, chosen: Sequence[TagReading]) -> float:
     return fit.squares_px2 / (8 * len(chosen))
 
 
@@ -156,7 +156,7 @@ def _angle(p_xyzw: Floats, q_xyzw: Floats) -> float:
     return float(np.linalg.norm(rotation_vector(multiply(p_xyzw, conjugate(q_xyzw)))))
 
 
-def _alone(chosen: Sequence[TagReading], joint: _Fit, *, by_a: bool) -> _Fit:
+def _alone(chosen: Sequence[TagReading], joint: _TagFit, *, by_a: bool) -> _TagFit:
     """Return the pose from one picture's tags, refined from the joint one; the joint one if it has no tags."""
     own = [reading for reading in chosen if reading.by_a is by_a]
     return (_fit((joint.t_m, joint.q_xyzw), own) or joint) if own else joint
@@ -164,7 +164,7 @@ def _alone(chosen: Sequence[TagReading], joint: _Fit, *, by_a: bool) -> _Fit:
 
 def _gather(
     seed: TagReading, start: tuple[Floats, Floats], readings: Sequence[TagReading]
-) -> tuple[list[TagReading], _Fit | None]:
+) -> tuple[list[TagReading], _TagFit | None]:
     """Return the readings that fit together with this one, and their pose."""
     fit = _fit(start, [seed])
     if fit is None or _mean(fit, [seed]) > _FIT_PX**2:
@@ -217,7 +217,7 @@ def _residuals(t_m: Floats, q_xyzw: Floats, stack: tuple[Floats, ...]) -> tuple[
     return ((image - rays) * focal_px).ravel(), J.reshape(-1, 6)
 
 
-def _fit(start: tuple[Floats, Floats], readings: Sequence[TagReading]) -> _Fit | None:
+def _fit(start: tuple[Floats, Floats], readings: Sequence[TagReading]) -> _TagFit | None:
     """Return the pose of least squares (Levenberg-Marquardt); None if it is not determined."""
     stack = (
         np.concatenate([reading.points_m for reading in readings]),
@@ -250,4 +250,4 @@ def _fit(start: tuple[Floats, Floats], readings: Sequence[TagReading]) -> _Fit |
     unit = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-12))
     if np.linalg.eigvalsh(H * np.outer(unit, unit))[0] < 1e-10:
         return None
-    return _Fit(t_m, q_xyzw, float(r @ r), H)
+    return _TagFit(t_m, q_xyzw, float(r @ r), H)
