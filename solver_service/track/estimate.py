@@ -33,10 +33,10 @@ class Estimate:
 
     The lights: detection (2, 2): by observer and light, how likely a light in the picture is found. last_seen (2,):
     the probability that each light is among the last picture's candidates, None where not both should be in it.
-    light_s: when a light was last used; trigger: time, observer and light of those of the last trigger. bars: how many
-    pictures showed both lights, bar_s: when one last did; told_by: how many of each node showed any. missed: in how
-    many of each node's last pictures, on end, a light should be and none was used. unseen_by: a node that has shown no
-    light yet.
+    light_s: when a light was last used, at first its start, which is made of lights; trigger: time, observer and light
+    of those of the last trigger. bars: how many pictures showed both lights, bar_s: when one last did; told_by: how
+    many of each node showed any. missed: in how many of each node's last pictures, on end, a light should be and none
+    was used. unseen_by: a node that has shown no light yet.
 
     How well it fits: evidence: log odds over clutter; evidence_by: of each node's pictures. baseline: the main
     estimate's at the start. surprise, told: chi^2 of the lights used, and of how many residuals. agreed_s: when a fix
@@ -94,6 +94,10 @@ class Estimate:
     course: list[tuple[float, float]] = field(default_factory=list)
     last_seen: Floats | None = None
     saw: list[tuple[int, float, Floats]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """No light is older than the start."""
+        self.light_s = max(self.light_s, self.start_s)
 
     @property
     def lights(self) -> int:

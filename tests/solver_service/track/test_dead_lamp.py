@@ -11,7 +11,10 @@ from buddyline.protocol.messages import LightTruth, NodePose, Track, TrackMode, 
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.track.dive import last_ns, smooth
+from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.inputs import FixSeen
+from buddyline.solver_service.track.smoother import rows_between, smoothed
+from buddyline.solver_service.track.start import constants_of
 from buddyline.solver_service.tracking import TrackSettings
 
 from tests.solver_service.track.dives import EPOCH_NS, KnownDive, Setting, filter_of, make, score
@@ -102,6 +105,18 @@ def test_the_replay_of_a_start_decides_the_lights_again() -> None:
     )
     assert wrong == 0
     assert share > 0.15
+
+
+def test_the_age_of_the_lights_is_known_before_the_first_is_used() -> None:
+    """A replay may leave out the lights of its own start; then there is a row before any light."""
+    dive = make(40, Setting(seconds=2.0))
+    track = filter_of(dive.records, ())
+    state, variances = constants_of(track.nodes, np.stack((np.eye(3), dive.R_a_b[0])), dive.t_a_b_m[0])
+    estimate = Estimate(1.0, state, np.diag(variances), 1.0)
+    track._open(estimate)
+    track._step(estimate, 1.05, None)
+    (row,) = rows_between(smoothed(estimate.steps), np.array((1.02,)), [EPOCH_NS])
+    assert row.age_s == pytest.approx(0.02)
 
 
 @pytest.mark.slow
