@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from base64 import b64decode
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -185,6 +186,22 @@ def test_what_follows_a_signature_counts_for_nothing(keys: Path) -> None:
     assert not Trust(keys / "ca.crt").refuses(
         "a", Signer.of(tls(keys, "node-a")).certificate, *reversed(unsealed(key, digest)[1:])
     )
+
+
+def test_a_signature_that_decodes_to_the_same_bytes_is_not_what_the_node_wrote(keys: Path) -> None:
+    """Two or four bits before base64's padding count for nothing; a changed character there is named all the same."""
+    # A signature has 70 to 72 bytes by chance, and padding unless it has 72.
+    digests = (written("a", keys, f"x{k}")[-1] for k in range(64))
+    key, digest, _ = next(one for one in digests if unsealed(*one[:2])[2].endswith("="))
+    signature = unsealed(key, digest)[2]
+    letters = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/"
+    last = signature.rstrip("=")[-1]
+    other = signature.rstrip("=")[:-1] + letters[letters.index(last) ^ 1] + "=" * signature.count("=")
+    assert b64decode(other) == b64decode(signature)
+    changed = digest.replace(signature.encode(), other.encode())
+    signer, trust = Signer.of(tls(keys, "node-a")), Trust(keys / "ca.crt")
+    assert not trust.refuses("a", signer.certificate, *reversed(unsealed(key, digest)[1:]))
+    assert trust.refuses("a", signer.certificate, *reversed(unsealed(key, changed)[1:]))
 
 
 def test_a_clock_that_was_set_back_is_no_fraud(keys: Path) -> None:
