@@ -10,6 +10,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol.errors import BuddylineError
@@ -38,7 +40,8 @@ class Service:
 
     A thread that ends with an exception ends the service: exit status 2 for a BuddylineError (one line), 1 for a bug
     (with its traceback). A thread that returns ends only itself. A thread that has called `heartbeat` once and then
-    does not call it for STUCK_S ends the process, with its name and status 1. problems: what is wrong, in words.
+    does not call it for STUCK_S ends the process, with its name and status 1; time in which the process waits for a
+    processor, or is frozen, does not count. problems: what is wrong, in words.
     status_message: the last status message. Both go into the status file, if there is one.
     """
 
@@ -53,6 +56,7 @@ class Service:
         self.failure: tuple[str, BaseException] | None = None
         self._threads: list[threading.Thread] = []
         self._heartbeat_s: dict[str, float] = {}
+        self._waited_s: dict[str, float] = {}
 
     def spawn(self, name: str, target: Callable[[], None]) -> threading.Thread:
         """Start a thread of this service, and return it."""
@@ -124,12 +128,20 @@ class Service:
             self._status_file.write(self.name, self.problems, self.status_message)
 
     def _look_for_stuck(self, now_s: float, stood_s: float) -> None:
-        """Fail if a thread has sent no heartbeat for STUCK_S. stood_s: by how much this thread's own wait was late."""
-        for name, heartbeat_s in list(self._heartbeat_s.items()):
-            # The process or the machine was frozen. Its threads are not stuck: their time begins anew.
-            if stood_s > WATCH_S:
-                self._heartbeat_s[name] = max(heartbeat_s + stood_s, self._heartbeat_s.get(name, 0.0))
-            elif now_s - heartbeat_s > STUCK_S:
+        """Fail if a thread has sent no heartbeat for STUCK_S. stood_s: by how much this thread's own wait was late.
+
+        A frozen process, or one that a busy machine lets wait, is not stuck: that time is not counted.
+        """
+        silent = any(now_s - heartbeat_s > STUCK_S / 2 for heartbeat_s in list(self._heartbeat_s.values()))
+        before, self._waited_s = self._waited_s, waited_for_processor_s() if silent else {}
+        # What a silent thread waits for may be what the one does that has waited longest.
+        waited_s = [seconds - before.get(thread, seconds) for thread, seconds in self._waited_s.items()]
+        lost_s = max([*waited_s, stood_s if stood_s > WATCH_S else 0.0])
+        for name, said_s in list(self._heartbeat_s.items()):
+            heartbeat_s = min(said_s + lost_s, now_s)
+            if lost_s > 0.0:
+                self._heartbeat_s[name] = max(heartbeat_s, self._heartbeat_s.get(name, 0.0))
+            if now_s - heartbeat_s > STUCK_S:
                 self.fail(name, StuckError(f"thread {name} is stuck: nothing for {now_s - heartbeat_s:.0f} s"))
                 faulthandler.dump_traceback(2)
                 self._end_anyway()
@@ -162,6 +174,15 @@ class Service:
             return 1
         log.error("%s: thread %s failed", self.name, where, exc_info=error)
         return 1
+
+
+def waited_for_processor_s() -> dict[str, float]:
+    """Return how long each thread of this process has been ready to run without a processor, s; {} outside Linux."""
+    found: dict[str, float] = {}
+    for task in Path("/proc/self/task").glob("*"):
+        with suppress(OSError, IndexError, ValueError):  # a thread may end meanwhile
+            found[task.name] = int((task / "schedstat").read_text().split()[1]) / 1e9
+    return found
 
 
 def start_logging(verbose: bool = False) -> None:

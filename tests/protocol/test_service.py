@@ -93,6 +93,52 @@ def test_a_process_that_was_frozen_is_not_stuck(watched):
     assert watched.failure is not None
 
 
+def test_a_thread_whose_process_waits_for_a_processor_is_not_stuck(watched, monkeypatch):
+    """One of its threads was ready to run for 0.9 of each second, and had no processor."""
+    waited_s = {"1": 0.0, "2": 0.0}
+    monkeypatch.setattr(module, "waited_for_processor_s", lambda: dict(waited_s))
+    for second in range(1, 61):
+        waited_s["1"] += 0.9
+        watched._look_for_stuck(100.0 + second, 0.1)
+    assert watched.failure is None
+    for second in range(61, 61 + round(STUCK_S) + 1):
+        watched._look_for_stuck(100.0 + second, 0.1)
+    assert isinstance(watched.failure[1], StuckError)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the kernel says how long a thread has waited")
+def test_a_thread_at_work_on_a_busy_machine_is_not_stuck():
+    """Its process has a tenth of a processor at most, and so needs 1.5 s for what takes it 0.15 s."""
+    program = textwrap.dedent(
+        """
+        import os, subprocess, sys, time
+        from buddyline.protocol import service as module
+        module.STUCK_S = 1.0
+        service = module.Service("solver")
+
+        def work():
+            service.heartbeat()
+            ends_s = time.thread_time() + 0.15
+            while time.thread_time() < ends_s:
+                pass
+            service.heartbeat()
+            service.stop.set()
+
+        os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1])
+        with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as other:
+            os.nice(10)
+            service.spawn("work", work)
+            service.wait()
+            other.kill()
+        sys.exit(service.join())
+        """
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", program], timeout=PATIENCE_S, check=False, cwd=REPOSITORY, capture_output=True
+    )
+    assert ended.returncode == 0, ended.stderr
+
+
 def test_a_signal_ends_a_service_that_waits():
     """The signal comes while the main thread holds the lock of the event that the handler is to set."""
     program = """
