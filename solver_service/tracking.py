@@ -34,7 +34,7 @@ from buddyline.solver_service.results import NUMERIC_ERRORS, view_of
 from buddyline.solver_service.sensors import KEPT_NS
 from buddyline.solver_service.streams import NodeStream
 from buddyline.solver_service.track.clocks import Clocks, clock_now, clocks_of
-from buddyline.solver_service.track.dive import NodeRecord, feed, joined, smooth
+from buddyline.solver_service.track.dive import smooth
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.foresight import ForeseenLight, foresee
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, TrackNode
@@ -42,6 +42,7 @@ from buddyline.solver_service.track.lag import EVERY_S, KEPT_S, TrackLag
 from buddyline.solver_service.track.lamps import UNSEEN_PICTURES, UNSEEN_S
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.problems import ENDED_S, as_ended
+from buddyline.solver_service.track.records import NodeRecord, feed, joined
 from msgspec import UNSET
 from msgspec.structs import replace
 

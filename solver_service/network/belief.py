@@ -33,15 +33,8 @@ from buddyline.solver_service.network.trail import Chosen, Grown, Learned, NetTr
 from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.inputs import AttitudeSeen, TrackNode
 from buddyline.solver_service.track.intake import TrackIntake, newest_before
-from buddyline.solver_service.track.stepping import (
-    ATTITUDE_EVERY_S,
-    HOLD_S,
-    TICK_S,
-    TOGETHER_S,
-    WITHOUT_RAD,
-    WITHOUT_RADPS,
-    increments,
-)
+from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S, WITHOUT_RAD, WITHOUT_RADPS, increments
+from buddyline.solver_service.track.stepping import ATTITUDE_EVERY_S, TICK_S
 from buddyline.solver_service.track.strapdown import Noise
 
 # With fixed nodes the heading of an attitude gets this factor: it does not count.

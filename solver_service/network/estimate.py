@@ -22,8 +22,10 @@ from buddyline.solver_service.track.association import weigh
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.intake import TrackIntake, newest_before
 from buddyline.solver_service.track.lights import Sight, in_picture, pixel_of, residuals
+from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S
+from buddyline.solver_service.track.seeing import EDGE_PX
 from buddyline.solver_service.track.start import tilt_of
-from buddyline.solver_service.track.stepping import EDGE_PX, HOLD_S, TICK_S, TOGETHER_S
+from buddyline.solver_service.track.stepping import TICK_S
 
 # A node is confirmed once its lights explain the pictures better than clutter by this (log odds). It leaves below
 # GIVEN_UP, or when it has not been confirmed within PATIENCE_S.

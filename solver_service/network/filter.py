@@ -22,9 +22,9 @@ from buddyline.solver_service.network.trail import NetTrail
 from buddyline.solver_service.track.inputs import FixSeen, TrackNode
 from buddyline.solver_service.track.intake import CHECK_EVERY_S, TrackIntake, newest_before
 from buddyline.solver_service.track.lights import Sight
+from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S
 from buddyline.solver_service.track.problems import Problems
 from buddyline.solver_service.track.samples import Samples
-from buddyline.solver_service.track.stepping import HOLD_S, TOGETHER_S
 from buddyline.solver_service.track.turning import Turning
 
 # FIXES_TO_JOIN poses of one pair in a row, no further apart in time than JOIN_WITHIN_S, and each in reach of the one

@@ -10,11 +10,12 @@ from typing import Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
-from buddyline.solver_service.track.dive import Records, in_order, smooth
+from buddyline.solver_service.track.dive import smooth
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import FixSeen
+from buddyline.solver_service.track.moving import KNOWN_CLOCK_S
+from buddyline.solver_service.track.records import Records, in_order
 from buddyline.solver_service.track.state import CLOCK
-from buddyline.solver_service.track.stepping import KNOWN_CLOCK_S
 
 # A stretch of about this length: on a much shorter one a track estimates the offset worse than over a dive.
 STRETCH_NS: Final = 60 * S_NS

@@ -14,12 +14,13 @@ from buddyline.solver_service.track.estimate import Estimate, alike, lead
 from buddyline.solver_service.track.inputs import AttitudeSeen, FixSeen, TrackNode
 from buddyline.solver_service.track.intake import newest_before
 from buddyline.solver_service.track.lights import BLOCK, Sight
+from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S
 from buddyline.solver_service.track.output import TrackRow, at_one_time, at_one_time_jacobian, pose_jacobian, rows_of
 from buddyline.solver_service.track.pool import MAX_TENTATIVE, TrackPool
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.start import CLOCK_S, state_from_fix
 from buddyline.solver_service.track.state import CLOCK, State, place_covariance
-from buddyline.solver_service.track.stepping import HOLD_S, TICK_S, TOGETHER_S
+from buddyline.solver_service.track.stepping import TICK_S
 from buddyline.solver_service.track.walking import Walking
 
 # Log odds by which an estimate must explain its pictures better than clutter to be confirmed, and a challenger better

@@ -11,7 +11,7 @@ import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.filter import StateNow, TrackFilter
 from buddyline.solver_service.track.lights import BLOCK, in_picture, light_positions, pixel_of
-from buddyline.solver_service.track.stepping import HOLD_S
+from buddyline.solver_service.track.moving import HOLD_S
 
 # How the nodes may move otherwise than at their last rates, 1 sd: a diver who turns his head, and who swims off.
 TURN_RADPS2: Final = 0.12

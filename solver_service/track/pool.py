@@ -14,14 +14,16 @@ from buddyline.solver_service.track.inputs import TrackNode
 from buddyline.solver_service.track.intake import newest_before
 from buddyline.solver_service.track.lamps import LampWatch
 from buddyline.solver_service.track.lights import BLOCK, Sight
+from buddyline.solver_service.track.lone import fits, state_of
+from buddyline.solver_service.track.moving import HOLD_S
 from buddyline.solver_service.track.search import starts
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.smoother import smoothed
 from buddyline.solver_service.track.start import CLOCK_S, constants_of
 from buddyline.solver_service.track.state import PHI, R_, State, of_place, place_covariance
-from buddyline.solver_service.track.stepping import HOLD_S, TICK_S, TrackSteps
+from buddyline.solver_service.track.stepping import TICK_S, TrackSteps
 from buddyline.solver_service.track.trail import Chosen, Trail
-from buddyline.solver_service.track.window import fits, gathered, state_of
+from buddyline.solver_service.track.window import gathered
 
 # A start without a fix: how often one is tried, how long after the last fix, for how long it and how many are kept.
 SEARCH_EVERY_S: Final = 0.45

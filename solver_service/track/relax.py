@@ -18,15 +18,25 @@ from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import TrackNode
 from buddyline.solver_service.track.lights import Sight
+from buddyline.solver_service.track.records import Records, pass_over
+from buddyline.solver_service.track.search import FURTHEST_M
+from buddyline.solver_service.track.seeing import PassGuide
 from buddyline.solver_service.track.shaking import Shaking
-from buddyline.solver_service.track.smoother import Path
+from buddyline.solver_service.track.smoother import Path, smoothed
 from buddyline.solver_service.track.start import BROAD_TURN_RAD, constants_of
-from buddyline.solver_service.track.state import MOVING, PHI, R_, of_place
-from buddyline.solver_service.track.stepping import PassGuide
+from buddyline.solver_service.track.state import MOVING, NAV, PHI, R_, of_place
 from buddyline.solver_service.track.trail import Look, Step
 
 # What is believed of the place at first, 1 sd, as a share of the range.
 BROAD_SHARE: Final = 0.5
+# A track that began with single lamps, or late, is passed over so often at most, until a pass moves no pose by so
+# many sigmas. It is one where chi^2 of each residual is below UNFIT, on average, and it takes LEAST_TOLD of the lights
+# of the first.
+LONE_PASSES: Final = 12
+STAYS_SIGMAS: Final = 0.3
+LOOKED_AT: Final = 10
+UNFIT: Final = 1.5
+LEAST_TOLD: Final = 0.5
 
 
 class PathFilter(TrackFilter):
@@ -129,3 +139,35 @@ class PathFilter(TrackFilter):
         self._off = self._off + estimate.state.minus(at)
         estimate.state = at
         return chi2
+
+
+def settled(
+    path: Path, detection: Floats, told: int, records: Records, clock_ns: int, shaking: Shaking, shares: Floats
+) -> tuple[PathFilter, Path] | None:
+    """Pass over a dive about the last pass's path until that does not move; None where it does not settle.
+
+    told: the pictures that the first pass used.
+    """
+    for _ in range(LONE_PASSES):
+        track = PathFilter((records[0].node, records[1].node), path, detection, shaking)
+        track.clock_ns = clock_ns
+        track.take_off(shares)
+        pass_over(track, records, ())
+        found = track.passed
+        old, path, detection = path, smoothed(found.steps, path), found.detection
+        if not bool(np.isfinite(path.states).all()):
+            return None
+        if _stays(old, path):
+            fits = found.surprise < UNFIT * found.told and sum(found.told_by) > LEAST_TOLD * told
+            near = np.linalg.norm(path.states[:, R_], axis=1).max() < FURTHEST_M
+            return (track, path) if fits and near else None
+    return None
+
+
+def _stays(old: Path, new: Path) -> bool:
+    """Whether a pass over a dive has left each pose where the pass before had it, by its covariance."""
+    for k in range(0, len(new), LOOKED_AT):
+        moved = new.state(k).minus(old.state(k))[:NAV]
+        if not moved @ np.linalg.solve(new.covariance(k)[:NAV, :NAV], moved) < NAV * STAYS_SIGMAS**2:
+            return False
+    return True

@@ -10,10 +10,10 @@ import numpy as np
 from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log
-from buddyline.solver_service.track.dive import NodeRecord, feed
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, TrackNode
 from buddyline.solver_service.track.output import TrackRow
+from buddyline.solver_service.track.records import NodeRecord, feed
 
 EPOCH_NS = 1_764_000_000_000_000_000
 GRAVITY = np.array((0.0, 0.0, 9.80665))

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from buddyline.solver_service.track.clocks import MIN_FIXES, clocks_of, line_through
-from buddyline.solver_service.track.dive import clock_off_by, last_ns, parts_of
+from buddyline.solver_service.track.parts import clock_off_by, parts_of
+from buddyline.solver_service.track.records import last_ns
 from buddyline.solver_service.track.state import CLOCK
 
 from tests.solver_service.track.dives import Setting, filter_of, make

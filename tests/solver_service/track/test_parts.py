@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from buddyline.solver_service.track.dive import goes_on, in_pieces, of_one_clock, parts_of
 from buddyline.solver_service.track.estimate import Estimate
+from buddyline.solver_service.track.parts import goes_on, in_pieces, of_one_clock, parts_of
 from buddyline.solver_service.track.state import CLOCK
 
 from tests.solver_service.track.dives import Setting, filter_of, make

@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from buddyline.solver_service.geometry.rotation import Floats
-from buddyline.solver_service.track.dive import parts_of, pass_over, smooth
+from buddyline.solver_service.track.dive import smooth
+from buddyline.solver_service.track.parts import parts_of
+from buddyline.solver_service.track.records import pass_over
 from buddyline.solver_service.track.relax import PathFilter
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.smoother import Path, smoothed

@@ -12,13 +12,14 @@ from itertools import product
 import numpy as np
 import pytest
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
-from buddyline.solver_service.track import stepping
-from buddyline.solver_service.track.dive import last_ns
+from buddyline.solver_service.track import seeing
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.lights import COLUMNS, Sight, light_positions, residuals, sight_of
+from buddyline.solver_service.track.moving import HOLD_S, KNOWN_CLOCK_S
+from buddyline.solver_service.track.records import last_ns
+from buddyline.solver_service.track.seeing import _widened
 from buddyline.solver_service.track.state import CLOCK, MOVING, PHI, R_, SIZE, V_, State
-from buddyline.solver_service.track.stepping import HOLD_S, KNOWN_CLOCK_S, _widened
 from buddyline.solver_service.track.strapdown import Noise
 from buddyline.solver_service.track.walking import Walking
 
@@ -77,7 +78,7 @@ def test_a_start_does_not_doubt_its_clock_and_a_confirmed_track_does(monkeypatch
         confirmed.append(track.main.confirmed)
         return _widened(sight, H, P)
 
-    monkeypatch.setattr(stepping, "_widened", noted)
+    monkeypatch.setattr(seeing, "_widened", noted)
     frames = sorted(frame.stamp_ns for record in dive.records for frame in record.frames)
     track.advance(frames[4])
     assert track.main is not None

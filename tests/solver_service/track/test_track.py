@@ -12,17 +12,12 @@ from buddyline.node.imu_means import ImuPacker
 from buddyline.protocol.messages import Imu
 from buddyline.solver_service.track import dive as dive_track
 from buddyline.solver_service.track.association import weigh
-from buddyline.solver_service.track.dive import (
-    NodeRecord,
-    Records,
-    last_ns,
-    pass_over,
-    smooth,
-)
+from buddyline.solver_service.track.dive import smooth
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.lag import TrackLag
 from buddyline.solver_service.track.output import TrackRow
+from buddyline.solver_service.track.records import NodeRecord, Records, last_ns, pass_over
 
 from tests.solver_service.track.dives import EPOCH_NS, KnownDive, Setting, filter_of, fix_errors, make, score
 

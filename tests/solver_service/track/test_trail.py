@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from buddyline.solver_service.track.dive import last_ns, parts_of
+from buddyline.solver_service.track.parts import parts_of
+from buddyline.solver_service.track.records import last_ns
 from buddyline.solver_service.track.smoother import smoothed
 from buddyline.solver_service.track.trail import PACK, Step, Trail
 

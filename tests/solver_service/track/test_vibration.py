@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from buddyline.solver_service.geometry.rotation import Floats
-from buddyline.solver_service.track.dive import in_order, parted, pass_over, smooth
+from buddyline.solver_service.track.dive import smooth
 from buddyline.solver_service.track.filter import TrackFilter
+from buddyline.solver_service.track.records import in_order, parted, pass_over
 from buddyline.solver_service.track.strapdown import SampleGrid, integrate, moved_by_shares, propagate
 from buddyline.solver_service.track.vibration import Shares, fast_part, sudden_turn
 

@@ -4,10 +4,11 @@ import math
 
 import numpy as np
 import pytest
-from buddyline.solver_service.track.dive import feed
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.lights import Sight
-from buddyline.solver_service.track.window import _SIZE, Fit, Window, fits, gathered, state_of
+from buddyline.solver_service.track.lone import fits, state_of
+from buddyline.solver_service.track.records import feed
+from buddyline.solver_service.track.window import PARAMETERS, Fit, Window, gathered
 
 from tests.solver_service.track.dives import EPOCH_NS, KnownDive, Setting, make
 
@@ -36,8 +37,8 @@ def test_the_jacobian_of_the_lights_is_that_of_numbers() -> None:
     lights_m = np.tile((-0.44, 0.01, 0.02), (len(at), 1))
     for observer in (0, 1):
         _, J = window.lights(observer, at, lights_m, fit)
-        for k in range(_SIZE):
-            step = np.zeros(_SIZE)
+        for k in range(PARAMETERS):
+            step = np.zeros(PARAMETERS)
             step[k] = 1e-5
             ahead, behind = (window.lights(observer, at, lights_m, fit.plus(d))[0] for d in (step, -step))
             assert np.abs((ahead - behind) / 2e-5 - J[:, :, k]).max() < 1e-3 * np.abs(J[:, :, k]).max() + 1e-3

@@ -1,0 +1,248 @@
+"""How an estimate moves from one time to the next: by inertial samples, or by what else tells its turning."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final, TypeVar
+
+import numpy as np
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.track import anchors
+from buddyline.solver_service.track.estimate import Estimate
+from buddyline.solver_service.track.inputs import TrackNode
+from buddyline.solver_service.track.intake import TrackIntake
+from buddyline.solver_service.track.samples import Samples
+from buddyline.solver_service.track.state import (
+    CLOCK,
+    GYRO_BIAS,
+    MOUNT,
+    MOVING,
+    PHI,
+    SHAKE,
+    SIZE,
+    State,
+    invariant_of_plain,
+)
+from buddyline.solver_service.track.strapdown import (
+    Carried,
+    Increments,
+    Noise,
+    SampleGrid,
+    guessed_noise,
+    integrate,
+    kept_shares,
+    moved_by_shares,
+    predicted,
+    process_noise,
+    propagate,
+)
+from numpy.typing import NDArray
+
+# How far past an event samples may lie and still count for it: the unit's delay, and one sample to interpolate to.
+HOLD_S: Final = 0.05
+# Two pictures nearer than this share a step: the state is carried over so short a time by its rates.
+TOGETHER_S: Final = 0.005
+# The clocks' offset is believed where it is known better than this, 1 sd. Only then is learned how much the biases
+# walk: an unknown offset looks like a walk.
+KNOWN_CLOCK_S: Final = 0.008
+MAX_DELAY_S: Final = 0.03
+# How fast a node without an inertial unit turns, and how far off its attitude may be, 1 sd.
+WITHOUT_RADPS: Final = 0.25
+WITHOUT_RAD: Final = 0.03
+# Beyond this chi^2 (3 degrees of freedom, a chance of 0.01) a node without a unit is taken to have begun to turn, by
+# at most so much: a head turned by 45 degrees in a second speeds up by 4 rad/s^2.
+STARTLED: Final = 11.3
+# A turn shows as residuals of one sign before any single one is that large: they are summed, each with LASTING of the
+# next one's weight. The sum's variance is SUMMED times one residual's.
+LASTING: Final = 0.6
+SUMMED: Final = 1.0 / (1.0 - LASTING**2)
+MOST_GAP_RATE: Final = 4.0
+Number = TypeVar("Number", np.float64, np.bool_)
+
+
+def increments(
+    of_nodes: Sequence[Samples], state: Carried, from_s: float, to_s: float, *, by_shares: bool = False
+) -> Increments:
+    """Integrate the samples of a state's nodes from one time to the next, each by its own clock's delay.
+
+    by_shares: whether to tell what shares of the samples' fast parts do.
+    """
+    known_s = to_s + HOLD_S
+    without = np.zeros(len(of_nodes), dtype=bool)
+    slow = np.empty((len(of_nodes), 2, 3))
+    grids, values, told = [], [], []
+    for node, (samples, delay_s) in enumerate(zip(of_nodes, state.delay_s.tolist(), strict=True)):
+        shift = min(max(delay_s, -MAX_DELAY_S), MAX_DELAY_S)
+        times_s, at, covered = samples.between(from_s + shift, to_s + shift, known_s)
+        without[node] = not covered.any() and not samples.near(to_s + shift, known_s)
+        if without[node]:
+            at[:, :6] = 0.0
+        for end, each_s in ((0, from_s + shift), (-1, to_s + shift)):
+            rate = samples.slow_rate(each_s, known_s)
+            slow[node, end] = at[end, 3:6] if rate is None else rate
+        grids.append(times_s)
+        values.append(at)
+        told.append(covered)
+    every = _padded(values)
+    fast = every[..., 6:12] if by_shares and any(samples.parted for samples in of_nodes) else None
+    parts = integrate(state, SampleGrid(_padded(grids), every[..., :6], _padded(told), slow, fast))
+    return replace(parts, without=without, sudden_rad=every[..., 12].max(axis=1))
+
+
+def _padded(rows: Sequence[NDArray[Number]]) -> NDArray[Number]:
+    """Give nodes' rows (N, M, ...), the last one repeated where another node has more: intervals of no length."""
+    most = max(map(len, rows))
+    return np.array([row if len(row) == most else row[np.minimum(np.arange(most), len(row) - 1)] for row in rows])
+
+
+class TrackMoves(TrackIntake):
+    """Moves estimates by the samples that have come in. unrest: how much of the guessed motion's noise is taken."""
+
+    nodes: tuple[TrackNode, TrackNode]
+
+    def __init__(self, nodes: tuple[TrackNode, TrackNode]) -> None:
+        super().__init__(nodes)
+        self.unrest = 1.0
+
+    def increments(self, estimate: Estimate, t_s: float) -> Increments:
+        """Integrate both nodes from the estimate's time to t_s."""
+        return increments(self.samples, estimate.state, estimate.t_s, t_s, by_shares=estimate.learns)
+
+    def _with_sudden(self, variances: Floats, sudden_rad: Floats) -> Floats:
+        """Give the variances (3,) of shaking with what the shares take off a camera's own sudden turns."""
+        lost = [samples.shares[1] * turn for samples, turn in zip(self.samples, sudden_rad, strict=True)]
+        widened: Floats = variances + np.square((*lost, 0.0))
+        return widened
+
+    def _noises(self, estimate: Estimate, t_s: float) -> tuple[Noise, Noise]:
+        gyro, accel, push, rate, wander = estimate.walking.densities.tolist()
+        noises = []
+        for node in (0, 1):
+            noise = self.samples[node].noise(t_s).scaled(self.unrest)
+            noise = replace(noise, gyro_bias_radps=gyro, accel_bias_mps2=accel)
+            if estimate.without[node]:
+                noise = replace(noise, gap_accel_mps=push, gap_rate_radps=rate)
+                stated = self.turning[node].stated(t_s)
+                if stated is not None:
+                    tilt, heading = stated
+                    noise = replace(noise, tilt_rad=tilt, gap_tilt_rad=wander * tilt, gap_heading_rad=wander * heading)
+            noises.append(noise)
+        return noises[0], noises[1]
+
+    def _move(self, estimate: Estimate, t_s: float) -> tuple[Floats, Floats, Floats]:
+        span_s = t_s - estimate.t_s
+        parts = self.increments(estimate, t_s)
+        a, b = self._noises(estimate, t_s)
+        # Where a unit stops or comes back, its angle in the mount begins anew.
+        shares = kept_shares(parts.without, (a, b), span_s) * (parts.without == estimate.without)
+        after, F = propagate(estimate.state, parts, span_s, shares)
+        noises = self._startled(estimate, after, F, 0, a, t_s), self._startled(estimate, after, F, 1, b, t_s)
+        learned = estimate.shaking.variances
+        shaking = self._with_sudden(learned, parts.sudden_rad)
+        Q, walk, shaken = process_noise(after, parts, noises, shaking, span_s, shares)
+        onward = F[:, :MOVING]
+        estimate.shaken = onward @ estimate.shaken @ onward.T + (learned / shaking)[:, None, None] * shaken
+        if parts.by_fast is not None:
+            by_shares = estimate.by_shares.copy()
+            by_shares[:MOVING] = F @ estimate.by_shares + moved_by_shares(after, parts.by_fast)
+            estimate.by_shares = by_shares
+        without_a, without_b = parts.without.tolist()
+        if self._follows_walk(estimate):
+            guessed, moved = self._guessed(estimate, after, F, parts, (a, b), noises, span_s, shares)
+            estimate.walking = estimate.walking.stepped(F, walk, (not without_a, not without_b), guessed, moved)
+        for node, without in enumerate((without_a, without_b)):
+            if without != estimate.without[node]:
+                # The unit has stopped, or come back: its constants and what stands in their place are told anew.
+                estimate.without[node] = without
+                walk[GYRO_BIAS[node].start - MOVING : GYRO_BIAS[node].stop - MOVING] += WITHOUT_RADPS**2
+                walk[MOUNT[node].start - MOVING : MOUNT[node].stop - MOVING] += WITHOUT_RAD**2
+        estimate.covariance = predicted(estimate.covariance, F, Q, walk)
+        estimate.state, estimate.t_s = after, t_s
+        estimate.rates_radps = parts.rate_radps
+        return F, Q, walk
+
+    @staticmethod
+    def _follows_walk(estimate: Estimate) -> bool:
+        """Whether derivatives by the walks are carried along: from when they are first learned on, without a break."""
+        if estimate.confirmed and estimate.learns and estimate.covariance[CLOCK, CLOCK] < KNOWN_CLOCK_S**2:
+            estimate.follows_walk = True
+        return estimate.follows_walk
+
+    @staticmethod
+    def _guessed(
+        estimate: Estimate,
+        after: State,
+        F: Floats,
+        parts: Increments,
+        noises: tuple[Noise, Noise],
+        taken: tuple[Noise, Noise],
+        span_s: float,
+        shares: Floats,
+    ) -> tuple[Floats | None, Floats]:
+        """Give what a step adds to the derivatives by the walks of nodes without units: of covariance and state.
+
+        Of a sudden turn, nothing is learned. Of a tilt error q that decays, q1 = k q0 + n, var n = s^2 (1 - k^2), the
+        logarithm of k is minus a number times the walk's variance: dk = k ln k, dvar n = -2 k^2 ln k s^2 dlog.
+        """
+        drift = np.zeros(SIZE)
+        if not parts.without.any():
+            return None, drift
+        guessed = guessed_noise(parts, noises, span_s, shares)
+        if taken != noises:
+            guessed[1] = 0.0
+        for node in (0, 1):
+            if parts.without[node]:
+                k = float(shares[node])
+                log_k = math.log(k) if k > 0.0 else 0.0
+                guessed[2, SHAKE[node], SHAKE[node]] *= -2.0 * k * k * log_k / max(1.0 - k * k, 1e-12)
+                drift[SHAKE[node]] = log_k
+        T = invariant_of_plain(after)
+        guessed[:, :MOVING, :MOVING] = T @ guessed[:, :MOVING, :MOVING] @ T.T
+        onward = predicted(estimate.covariance, F, np.zeros((MOVING, MOVING)), np.zeros(SIZE - MOVING))
+        less = drift[:, None] * onward
+        guessed[2] += less + less.T
+        for node in (0, 1):
+            drift[SHAKE[node]] *= after.shake_rad[node]
+        return guessed, drift
+
+    def _startled(self, estimate: Estimate, after: State, F: Floats, node: int, noise: Noise, to_s: float) -> Noise:
+        """Return the noise of a step to to_s; more of it where a node without a unit turns otherwise than it did.
+
+        A diver who looks away turns within tenths of a second as he has not for minutes: attitude messages say so.
+        """
+        near = self.turning[node].at(to_s, to_s + HOLD_S) if estimate.without[node] else None
+        if near is None:
+            return noise
+        R_level_camera, variances = near
+        y = anchors.attitude_residual(after, node, R_level_camera)[0] - after.mount_rad[node] - after.shake_rad[node]
+        H = F[PHI[node]] + F[SHAKE[node]]
+        H[:, MOUNT[node]] += np.eye(3)
+        span_s = to_s - estimate.t_s
+        walks = (noise.gap_tilt_rad, noise.gap_tilt_rad, noise.gap_heading_rad)
+        S = H @ estimate.covariance @ H.T + np.diag(np.square(walks) * span_s)
+        S += noise.gap_rate_radps**2 * span_s**3 / 3.0 * np.eye(3) + (R_level_camera * variances) @ R_level_camera.T
+        whitened = np.linalg.solve(np.linalg.cholesky(S), y)
+        lasting = whitened + LASTING * estimate.turning_off[node]
+        estimate.turning_off[node] = lasting
+        if max(float(whitened @ whitened), float(lasting @ lasting) / SUMMED) < STARTLED:
+            return noise
+        estimate.turning_off[node] = np.zeros(3)
+        rate = math.sqrt(float(y @ y) / max(span_s, TOGETHER_S) ** 3)
+        return replace(noise, gap_rate_radps=max(noise.gap_rate_radps, min(rate, MOST_GAP_RATE)))
+
+    def _predict(
+        self, estimate: Estimate, t_s: float, least_s: float = 0.0, parts: Increments | None = None
+    ) -> tuple[State, Floats]:
+        """Return state and covariance at t_s. parts: `increments` to there, where they are known already."""
+        span_s = t_s - estimate.t_s
+        if span_s <= least_s:
+            return estimate.state, estimate.covariance
+        parts = self.increments(estimate, t_s) if parts is None else parts
+        noises = self._noises(estimate, t_s)
+        shares = kept_shares(parts.without, noises, span_s) * (parts.without == estimate.without)
+        after, F = propagate(estimate.state, parts, span_s, shares)
+        shaking = self._with_sudden(estimate.shaking.variances, parts.sudden_rad)
+        Q, walk, _ = process_noise(after, parts, noises, shaking, span_s, shares)
+        return after, predicted(estimate.covariance, F, Q, walk)

@@ -1,0 +1,231 @@
+"""What a picture tells an estimate: which candidates are lights, and where these say that the nodes are."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.track import anchors
+from buddyline.solver_service.track.association import Association, associate
+from buddyline.solver_service.track.estimate import Estimate
+from buddyline.solver_service.track.inputs import TrackNode
+from buddyline.solver_service.track.lights import (
+    BLOCK,
+    COLUMNS,
+    Sight,
+    in_picture,
+    light_positions,
+    pixel_of,
+    residuals,
+)
+from buddyline.solver_service.track.moving import KNOWN_CLOCK_S, TrackMoves
+from buddyline.solver_service.track.smoother import Path
+from buddyline.solver_service.track.state import (
+    CLOCK,
+    MOVING,
+    NAV,
+    R_,
+    SIZE,
+    V_,
+    State,
+    place_covariance,
+)
+from buddyline.solver_service.track.trail import Chosen, Look
+
+# Both nodes' pictures of one trigger are less than this apart.
+ONE_TRIGGER_S: Final = 0.03
+# A light nearer to the picture's edge need not be found: part of its spot is outside.
+EDGE_PX: Final = 2.0
+# Without units, the place must also be known better than to this share of the range, 1 sd: the error of linearization
+# looks like a walk, too.
+WIDE_SHARE: Final = 0.02
+# A wide estimate takes its lights in so many steps.
+ABOUT_STEPS: Final = 4
+_STILL: Final = np.eye(MOVING)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PassGuide:
+    """What a whole pass over the dive knew at one picture, for the next pass to decide its lights again.
+
+    path, step: of the pass. look: the picture.
+    """
+
+    path: Path
+    step: int
+    look: Look
+
+
+class TrackSights(TrackMoves):
+    """Updates estimates by pictures. guides: by node and stamp of a picture."""
+
+    def __init__(self, nodes: tuple[TrackNode, TrackNode]) -> None:
+        super().__init__(nodes)
+        self.guides: dict[tuple[int, int], PassGuide] = {}
+
+    def guide_by(self, path: Path) -> None:
+        """Tell what a pass knew at each picture."""
+        for step, looks in enumerate(path.looks):
+            for look in looks:
+                self.guides[look.node, look.stamp_ns] = PassGuide(path, step, look)
+
+    def _take_lights(self, estimate: Estimate, sight: Sight) -> Look:
+        observer = sight.node
+        camera = self.nodes[observer].rig.camera
+        X, y, H = self._compared(sight, estimate.state, estimate.rates_radps, sight.t_s - estimate.t_s)
+        # Starts are weighed by their evidence: one that doubts its own clock must not explain more with it.
+        if estimate.confirmed:
+            sight = _widened(sight, H, estimate.covariance)
+        detection = estimate.detection[observer]
+        place = place_covariance(estimate.state, estimate.covariance)
+        share = math.sqrt(place.trace()) / float(np.linalg.norm(estimate.state.r_m))
+        wide, estimate.wide = share > 0.1, share > WIDE_SHARE
+        if wide:
+            inside = [True, True]
+        else:
+            inside = [in_picture(camera, pixel_of(camera, X[0, light]), EDGE_PX) for light in (0, 1)]
+            detection = detection * np.where(inside, 1.0, 0.02)
+        clutter = sight.clutter / camera.area_px2
+        guide = self.guides.get((observer, sight.stamp_ns))
+        given = estimate.given.get((observer, sight.stamp_ns))
+        if given is not None:
+            found = Association(given, np.zeros(2), 0.0)
+        elif guide is None:
+            found = associate(y, H, estimate.covariance[BLOCK], sight.sigma_px, detection, clutter)
+        else:
+            found = associate(*self._without(guide, sight), sight.sigma_px, detection, clutter)
+        if wide and found.chosen and estimate.confirmed:
+            y, H = self._about(estimate, sight, found.chosen, guide)
+        # What another estimate chose may be behind the camera by this one.
+        found = replace(found, chosen=_in_front(found.chosen, y))
+        estimate.trigger = [seen for seen in estimate.trigger if abs(sight.t_s - seen[0]) < ONE_TRIGGER_S]
+        estimate.evidence += found.evidence
+        estimate.evidence_by[observer] += found.evidence
+        if any(inside) and not wide:
+            estimate.missed[observer] = 0 if found.chosen else estimate.missed[observer] + 1
+        estimate.last_seen = found.seen if all(inside) and not wide else None
+        for light in (0, 1):
+            if inside[light]:
+                old = estimate.detection[observer, light]
+                estimate.detection[observer, light] = min(max(old + 0.05 * (found.seen[light] - old), 0.02), 0.97)
+        if found.chosen:
+            self._update_lights(estimate, found, y, H, sight)
+            if not estimate.confirmed:
+                estimate.used[observer, sight.stamp_ns] = found.chosen
+            if estimate.unseen_by == observer:
+                estimate.unseen_by = None
+            if len(found.chosen) == 2:
+                estimate.bars += 1
+                estimate.bar_s = sight.t_s
+            estimate.told_by[observer] += 1
+        return Look(observer, sight.stamp_ns, sight.t_s, found.chosen)
+
+    def _compared(
+        self, sight: Sight, state: State, rates_radps: Floats, after_s: float
+    ) -> tuple[Floats, Floats, Floats]:
+        """Give the lights (camera frame), residuals and Jacobians of a picture after_s after a state."""
+        lights_m = self.nodes[1 - sight.node].rig.lights_m
+        X, D = light_positions(state, sight.node, lights_m, rates_radps, sight.dt_s + after_s)
+        y, H = residuals(sight.bearings, sight.tangents, X, D)
+        return X, y, H
+
+    def _without(self, guide: PassGuide, sight: Sight) -> tuple[Floats, Floats, Floats]:
+        """Give residuals, Jacobians and covariance by all the dive but this picture.
+
+        The picture's own part is taken out of the smoothed estimate: P' = P + K H P, K = P H^T (R - H P H^T)^-1.
+        """
+        path, step = guide.path, guide.step
+        after_s = guide.look.t_s - float(path.t_s[step])
+        _, y, H = self._compared(sight, path.state(step), path.rates_radps[step], after_s)
+        P = path.covariance(step)
+        chosen = _in_front(guide.look.chosen, y)
+        if chosen:
+            H_used = np.concatenate([H[k, light] for k, light, _ in chosen])
+            y_used = np.concatenate([y[k, light] for k, light, _ in chosen])
+            R = np.diag(np.repeat([variance for _, _, variance in chosen], 2))
+            across = P @ H_used.T
+            rest = R - H_used @ across
+            # Rounding, and pictures that share a step, can leave less than nothing.
+            values, vectors = np.linalg.eigh(rest)
+            inverse = (vectors / np.maximum(values, 0.02 * R[0, 0])) @ vectors.T
+            gain = across @ inverse
+            P = P + gain @ across.T
+            y = y + H @ (gain @ y_used)
+        return y, H, P
+
+    def _about(
+        self, estimate: Estimate, sight: Sight, chosen: Chosen, guide: PassGuide | None
+    ) -> tuple[Floats, Floats]:
+        """Give residuals and Jacobians by the estimate's errors, but linear where the chosen lights say it is.
+
+        After seconds without light one linear step from the prediction ends far from the lights, with the sigma of a
+        sound one. These steps (Gauss-Newton, the iterated update) begin where an earlier pass, if any, had the nodes.
+        """
+        error = np.zeros(SIZE) if guide is None else guide.path.state(guide.step).minus(estimate.state)
+        error[NAV:] = 0.0
+        for left in reversed(range(ABOUT_STEPS)):
+            state, after_s = estimate.state.plus(error), sight.t_s - estimate.t_s
+            _, y, H = self._compared(sight, state, estimate.rates_radps, after_s)
+            y = y + H @ error[COLUMNS]
+            if left and (near := _in_front(chosen, y)):
+                error = anchors.kalman(estimate.covariance, *_rows(near, y, H))[0]
+        return y, H
+
+    def _update_lights(self, estimate: Estimate, found: Association, y: Floats, H: Floats, sight: Sight) -> None:
+        rows_H, rows_y, noise = _rows(found.chosen, y, H)
+        chi2 = self._apply(estimate, rows_H, rows_y, noise, teaches=True)
+        estimate.surprise += chi2
+        estimate.told += len(rows_y)
+        estimate.light_s = max(estimate.light_s, sight.t_s)
+        estimate.trigger += [(sight.t_s, sight.node, light) for _, light, _ in found.chosen]
+
+    @staticmethod
+    def _apply(estimate: Estimate, H: Floats, y: Floats, noise: Floats, *, teaches: bool = False) -> float:
+        before = estimate.covariance
+        error, estimate.covariance, chi2, S_inverse, gain = anchors.kalman(before, H, y, noise)
+        estimate.state = estimate.state.plus(error)
+        if estimate.by_shares.any():
+            moved = H @ estimate.by_shares
+            if teaches:
+                estimate.shares = estimate.shares.taught(y, S_inverse, moved)
+            estimate.by_shares = estimate.by_shares - gain @ moved
+        if estimate.follows_walk:
+            learns = before[CLOCK, CLOCK] < KNOWN_CLOCK_S**2 and not (estimate.wide and any(estimate.without))
+            estimate.walking = estimate.walking.taught(y, S_inverse, H, gain, learns=learns)
+        # Depth and attitudes remove little of what shaking adds: to follow that would not be worth its time.
+        if teaches:
+            moving = H[:, :MOVING]
+            estimate.shaking = estimate.shaking.taught(y, S_inverse, moving[:, :NAV], estimate.shaken[:, :NAV, :NAV])
+            rest = _STILL - gain[:MOVING] @ moving
+            estimate.shaken = rest @ estimate.shaken @ rest.T
+        return chi2
+
+
+def _rows(chosen: Chosen, y: Floats, H: Floats) -> tuple[Floats, Floats, Floats]:
+    """Give Jacobians (2 N, SIZE), residuals (2 N,) and noise of the chosen candidates, of y and H of all."""
+    rows_H = np.zeros((2 * len(chosen), SIZE))
+    rows_H[:, COLUMNS] = np.concatenate([H[k, light] for k, light, _ in chosen])
+    rows_y = np.concatenate([y[k, light] for k, light, _ in chosen])
+    return rows_H, rows_y, np.diag(np.repeat([variance for _, _, variance in chosen], 2))
+
+
+def _in_front(chosen: Chosen, y: Floats) -> Chosen:
+    """Return those candidates of lights that the residuals y (K, 2, 2) have in front of the camera."""
+    return tuple(one for one in chosen if np.isfinite(y[one[0], one[1]]).all())
+
+
+def _widened(sight: Sight, H: Floats, P: Floats) -> Sight:
+    """Give a picture whose sigmas hold what its Jacobians H (K, L, 2, C) leave out of the clock.
+
+    In A's pictures B stands at r + c v. Where both the clock c and the velocity v are unknown their product's variance,
+    var c var v + cov(c, v)^2, is no part of H P H^T: a track would believe a wrong offset within its first second.
+    """
+    if sight.node or not len(H):
+        return sight
+    unknown = P[CLOCK, CLOCK] * P[V_, V_] + np.outer(P[V_, CLOCK], P[V_, CLOCK])
+    by_place = H[0, 0, :, R_]
+    variance_px2 = 0.5 * float(np.trace(by_place @ unknown @ by_place.T))
+    return replace(sight, sigma_px=np.sqrt(sight.sigma_px**2 + variance_px2))
