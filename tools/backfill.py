@@ -14,36 +14,39 @@ from typing import TypeAlias
 
 import numpy as np
 from buddyline.protocol.divelog import DiveLogReader, Record
-from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.messages import Expect
+from buddyline.protocol.topics import EXPECT
 from buddyline.tools.authenticity import AUTHENTICITY, check_logs
 from buddyline.tools.dives import Dive
 from buddyline.tools.newfile import new_dive_log
 
-Stamps: TypeAlias = dict[str, tuple[np.ndarray, np.ndarray]]  # key: stamps (ns), sorted, and their payloads' CRC-32
+Stamps: TypeAlias = dict[str, tuple[np.ndarray, np.ndarray]]  # series: stamps (ns), sorted, and their payloads' CRC-32
 
 
 class Union:
-    """Chooses the messages of several logs' union: each key and stamp once, from the first log that has it."""
+    """Chooses the messages of several logs' union: each series and stamp once, from the first log that has it."""
 
     def __init__(self) -> None:
         self.differing: Counter[str] = Counter()
         self._known: Stamps = {}
 
     def choose(self, reader: DiveLogReader) -> dict[str, np.ndarray]:
-        """Read a log once; return for each key which of its messages, in their order, are new: (n,) bool."""
+        """Read a log once; return for each series which of its messages, in their order, are new: (n,) bool."""
         stamps: defaultdict[str, array[int]] = defaultdict(lambda: array("q"))
         sums: defaultdict[str, array[int]] = defaultdict(lambda: array("L"))
         for record in reader.records():
-            stamps[record.key].append(_stamp_ns(record))
-            sums[record.key].append(zlib.crc32(record.payload))
-        return {key: self._choose(key, np.array(stamps[key]), np.array(sums[key])) for key in stamps}
+            series = _series(record)
+            stamps[series].append(_stamp_ns(record))
+            sums[series].append(zlib.crc32(record.payload))
+        return {series: self._choose(series, np.array(stamps[series]), np.array(sums[series])) for series in stamps}
 
-    def _choose(self, key: str, stamps: np.ndarray, sums: np.ndarray) -> np.ndarray:
-        known, known_sums = self._known.get(key, (np.empty(0, stamps.dtype), np.empty(0, sums.dtype)))
+    def _choose(self, series: str, stamps: np.ndarray, sums: np.ndarray) -> np.ndarray:
+        known, known_sums = self._known.get(series, (np.empty(0, stamps.dtype), np.empty(0, sums.dtype)))
         every, every_sum = np.concatenate([known, stamps]), np.concatenate([known_sums, sums])
         kept, first, which = np.unique(every, return_index=True, return_inverse=True)
-        self.differing[key] += int(np.count_nonzero(every_sum[first][which] != every_sum))
-        self._known[key] = (kept, every_sum[first])
+        self.differing[_key(series)] += int(np.count_nonzero(every_sum[first][which] != every_sum))
+        self._known[series] = (kept, every_sum[first])
         new = np.zeros(len(every), bool)
         new[first] = True
         return new[len(known) :]
@@ -58,7 +61,10 @@ def run(args: argparse.Namespace) -> int:
         topside = Path(args.topside)
         ordered = sorted(dive.readers, key=lambda reader: reader.path == topside)
         chosen = [union.choose(reader) for reader in ordered]
-        before = {key: len(new) for key, new in chosen[-1].items()} if ordered[-1].path == topside else {}
+        before: Counter[str] = Counter()
+        if ordered[-1].path == topside:
+            for series, new in chosen[-1].items():
+                before[_key(series)] += len(new)
         added: Counter[str] = Counter()
         streams = [_new(reader, new) for reader, new in zip(ordered, chosen, strict=True)]
         metadata = {
@@ -76,17 +82,36 @@ def run(args: argparse.Namespace) -> int:
                 raise BuddylineError(f"{dive.name}: no message can be read")
     for key, count in sorted(added.items()):
         differing = f", {union.differing[key]} differ (the node's own are kept)" if union.differing[key] else ""
-        print(f"  {key}: {before.get(key, 0)} topside, {count} now{differing}", file=sys.stderr)
-    print(f"{args.output}: {sum(added.values())} messages, {sum(before.values())} of them topside", file=sys.stderr)
+        print(f"  {key}: {before[key]} topside, {count} now{differing}", file=sys.stderr)
+    print(f"{args.output}: {sum(added.values())} messages, {before.total()} of them topside", file=sys.stderr)
     return 0
 
 
 def _new(reader: DiveLogReader, new: dict[str, np.ndarray]) -> Iterator[Record]:
     at: Counter[str] = Counter()
     for record in reader.records():
-        if new[record.key][at[record.key]]:
+        series = _series(record)
+        if new[series][at[series]]:
             yield record
-        at[record.key] += 1
+        at[series] += 1
+
+
+def _series(record: Record) -> str:
+    """Return in what a message's stamp is its own: its key, and of what a picture is to show, whose lights too.
+
+    A node that sees two others has expectations of both for one picture.
+    """
+    if record.schema_name != EXPECT.schema_name:
+        return record.key
+    try:
+        message = record.open().message
+    except MessageError:
+        return record.key
+    return f"{record.key} {message.seen}" if isinstance(message, Expect) else record.key
+
+
+def _key(series: str) -> str:
+    return series.partition(" ")[0]
 
 
 def _stamp_ns(record: Record) -> int:

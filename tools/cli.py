@@ -65,7 +65,7 @@ class Command:
 COMMANDS: Final = (
     Command(
         "demo",
-        "run a hub, two simulated nodes and the solver on this machine, and watch the poses",
+        "run a hub, simulated nodes and the solver on this machine, and watch the poses",
         ("demo", "demo --environment lake --seconds 30"),
         "tools.demo.command",
     ),

@@ -8,7 +8,17 @@ from buddyline.node.sim.scenario import DivePlan, Scenario
 from buddyline.node.sim.world import World
 from buddyline.protocol.codec import encode
 from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
-from buddyline.protocol.messages import Attitude, Candidates, CompressedImage, Depth, FoxgloveTime, Mark, NodeInfo
+from buddyline.protocol.messages import (
+    Attitude,
+    Candidates,
+    CompressedImage,
+    Depth,
+    Expect,
+    ExpectedLight,
+    FoxgloveTime,
+    Mark,
+    NodeInfo,
+)
 from buddyline.protocol.topics import key_of
 from buddyline.tools.cli import main
 from msgspec.structs import replace
@@ -133,3 +143,23 @@ def test_a_team_is_completed_from_as_many_logs_as_there_are_nodes(tmp_path, caps
     frames = sum(isinstance(message, Candidates) and message.node == "d" for message in messages)
     early = sum(isinstance(one, Candidates) and one.node == "d" and one.stamp_ns < begin_ns + S_NS for one in messages)
     assert f"buddyline/node/d/candidates: {early} topside, {frames} now" in said
+
+
+def test_what_is_expected_of_two_nodes_in_one_picture_is_kept(tmp_path):
+    """A sees b and c: the solver says for each where its lamps will be in a's next picture."""
+    light = ExpectedLight(
+        side="left", u_px=9.0, v_px=9.0, covariance_px2=(1.0, 0.0, 1.0), rate_pxps=(0.0, 0.0), sigma_rate_pxps=1.0
+    )
+    messages = [
+        Expect(node="a", seen=seen, stamp_ns=(10 + k) * S_NS, valid_ns=S_NS, lights=[light])
+        for k in range(3)
+        for seen in ("b", "c")
+    ]
+    paths = [tmp_path / f"{name}.mcap" for name in ("topside", "a", "out")]
+    for path, kept in zip(paths, (messages, messages[:3]), strict=False):
+        with DiveLogWriter(path) as writer:
+            for message in kept:
+                writer.write_message(message)
+    topside, own, out = map(str, paths)
+    assert main(["backfill", topside, own, "-o", out]) == 0
+    assert [record.open().message for record in read(out)] == messages

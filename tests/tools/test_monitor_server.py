@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import math
 import re
 import threading
 import urllib.error
@@ -245,6 +246,26 @@ class TestFrames:
         assert set(nodes) == {"a", "b", "c", "d"}
         assert nodes["d"]["t"] == [4.0, 0.0, 0.0]
         assert nodes["d"]["label"] == "d, 13.0 m deep"
+
+    def test_a_node_stands_where_the_net_knows_it_when_the_pairs_pose_is_old(self) -> None:
+        """A's attitude is not known: A is drawn level, and the others as it sees them, whatever the net's axes are."""
+        overview = Overview(("a", "b"))
+        take(overview, INFOS["a"], at(0))
+        take(overview, pose(0, (0.0, 0.0, 7.0), node_b="c"), at(0))
+        half = math.sqrt(0.5)
+        for node, y_m in (("a", 1.0), ("c", 5.0)):
+            # Their cameras look along the net's y axis.
+            place = NodePose(
+                net="main", node=node, stamp_ns=at(29), p_m=(0.0, y_m, 0.0), q_xyzw=(0.0, half, half, 0.0),
+                v_mps=(0.0, 0.0, 0.0), covariance=[0.0] * 36, fixed=False, mode="filter", age_s=0.0,
+            )  # fmt: skip
+            take(overview, place, at(29))
+        frame = Viewer(live=True).frame(overview, at(29))["scene"]
+        assert not frame["levelled"]
+        nodes = {node["id"]: node for node in frame["nodes"]}
+        assert set(nodes) == {"a", "c"}
+        assert nodes["c"]["t"] == pytest.approx([4.0, 0.0, 0.0], abs=1e-3)
+        assert not nodes["c"]["stale"]
 
     def test_a_team_is_well_when_all_its_nodes_send(self) -> None:
         overview = filled()

@@ -116,3 +116,17 @@ def test_three_blinks_are_said_once_while_they_are_seen(a_pose):
     (readings,) = of_messages([*stream, *recorded])
     assert readings.marks == recorded
     assert new_blinks(recorded, []) == recorded
+
+
+def test_three_blinks_that_two_nodes_see_are_one_mark(a_pose):
+    seen, poses = watched(np.random.default_rng(1), a_pose, pattern(8, 0.5, 0.5, 0.5, 0.5, 0.5, 9), missed=0.0)
+    dive = world.dive(world.line(np.random.default_rng(2), 1), np.random.default_rng(7), rest_s=1.0)
+    infos = [one for one in dive if isinstance(one, NodeInfo)]
+    stream = [*infos, world.renamed(infos[0], a="c", b="c")]
+    for one in seen:
+        told = [one, *([poses[one.trigger]] if one.trigger in poses else [])]
+        stream += [*told, *(world.renamed(message, a="c") for message in told)]
+    live = LiveLegs(SurveySettings(), AlarmSettings())
+    said = [mark for message in stream for mark in live.handle(message) if mark.kind == "point"]
+    assert said == find_blinks(seen, poses)
+    assert [mark.node for mark in said] == ["b"]

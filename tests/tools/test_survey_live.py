@@ -109,3 +109,14 @@ def test_two_pairs_are_watched_live():
     for message in wrong:
         said += live.handle(message) + live.handle(world.renamed(message, a="c", b="d"))
     assert {mark.node for mark in said if mark.name == "depth"} == {"a", "b", "c", "d"}
+
+
+def test_in_a_team_of_three_each_verdict_names_its_pair():
+    rng = np.random.default_rng(11)
+    messages = world.dive(world.line(rng, 2), rng, rest_s=12.0, swim_s=2.0)
+    live = LiveLegs(SurveySettings(), AlarmSettings())
+    # C is where b is, and does what b does.
+    team = [each for message in messages for each in (message, world.renamed(message, b="c"))]
+    said = [mark for message in team for mark in live.handle(message)]
+    told = {node: {mark.note.partition(": ")[0] for mark in said if mark.node == node} for node in "abc"}
+    assert told == {"a": {"a/b", "a/c"}, "b": {"a/b"}, "c": {"a/c"}}

@@ -218,7 +218,12 @@ def scene(overview: Overview, picture: PairPicture, now_ns: int) -> dict[str, An
             node = _placed(other, frame, overview.nodes.get(pair[1]), now_ns)
             if node is not None:
                 nodes.append(node)
-    nodes += _of_net(overview, name_a, {node["id"] for node in nodes}, now_ns)
+    in_net = {} if name_a is None else _of_net(overview, name_a, frame, now_ns)
+    # Another pair's last pose says less than where the net knows that node to be now.
+    fresh = {name for name, node in in_net.items() if not node["stale"] and name != name_b}
+    nodes = [in_net[node["id"]] if node["stale"] and node["id"] in fresh else node for node in nodes]
+    placed = {node["id"] for node in nodes}
+    nodes += [node for name, node in in_net.items() if name not in placed]
     depth_m = node_a.depth.depth_m if node_a is not None and node_a.depth is not None else None
     seen: list[int] = [0, 0, 0, 0]
     if picture.pose is not None and picture.pose_ns is not None and now_ns - picture.pose_ns < S_NS:
@@ -243,19 +248,21 @@ def _placed(picture: PairPicture, frame: SceneFrame, node: NodePicture | None, n
     }
 
 
-def _of_net(overview: Overview, name_a: str | None, placed: set[str], now_ns: int) -> list[dict[str, Any]]:
-    """Return the net's nodes that no pair of A places, from A's own place in the net."""
-    base = overview.net.get(name_a or "")
+def _of_net(overview: Overview, name_a: str, frame: SceneFrame, now_ns: int) -> dict[str, dict[str, Any]]:
+    """Return the other nodes of A's net by name, from A's own place in it."""
+    base = overview.net.get(name_a)
     if base is None:
-        return []
-    found = []
+        return {}
+    # The net's axes are the scene's, unless A is drawn level because its attitude is not known.
+    R_s_net = np.eye(3) if frame.levelled else frame.R_s_a @ quat_to_matrix(np.array(base[0].q_xyzw)).T
+    found = {}
     for name, (pose, at_ns) in sorted(overview.net.items()):
-        if name not in placed and pose.net == base[0].net:
-            t_m = np.subtract(pose.p_m, base[0].p_m)
-            R = quat_to_matrix(np.array(pose.q_xyzw))
-            stale = now_ns - at_ns > S_NS
+        if name != name_a and pose.net == base[0].net:
+            t_m = R_s_net @ np.subtract(pose.p_m, base[0].p_m)
+            R = R_s_net @ quat_to_matrix(np.array(pose.q_xyzw))
             label = f"{name}{_depth_words(overview.nodes.get(name))}"
-            found.append({"id": name, "label": label, "t": t_m.tolist(), "R": _flat(R), "stale": stale})
+            t = [round(x, 4) for x in t_m.tolist()]
+            found[name] = {"id": name, "label": label, "t": t, "R": _flat(R), "stale": now_ns - at_ns > S_NS}
     return found
 
 

@@ -77,17 +77,18 @@ class _Pair:
 
     nodes: tuple[str, str]
     judged: list[_JudgedRest] = field(default_factory=list)
-    blinks: list[Mark] = field(default_factory=list)
     checked_ns: int = 0
 
 
 class LiveLegs:
     """Takes messages of any number of nodes, in any order; returns marks: verdicts on rests, points by blinks.
 
-    A verdict is a mark of both nodes; three blinks are one of the node that blinked.
+    A verdict is a mark of both nodes; where there are more than two, its note begins with the pair. Three blinks are
+    one mark of the node that blinked, however many nodes see them.
     Mark of kind `leg` and name `good`: the leg carries no alarm. Of kind `alarm`: measure again; its name is the check.
     A rest is judged by what `survey legs` would say of it. Later rests may show more of an earlier one, by the usual
-    magnetic field: then the mark is of an earlier leg, and its note begins with that leg's name and time.
+    magnetic field: then the mark is of an earlier leg, and its note begins with that leg's name and time (after the
+    pair).
     """
 
     def __init__(self, settings: SurveySettings, limits: AlarmSettings) -> None:
@@ -96,6 +97,7 @@ class LiveLegs:
         # By kind and by the ids of its node or pair.
         self._recent: dict[tuple[type[Message], tuple[str, ...]], deque[_Stamped]] = {}
         self._pairs: dict[tuple[str, str], _Pair] = {}
+        self._blinks: deque[Mark] = deque(maxlen=MARKS)
         self._marks: deque[Mark] = deque(maxlen=MARKS)
 
     def handle(self, message: Message) -> list[Mark]:
@@ -135,8 +137,8 @@ class LiveLegs:
         (readings,) = of_messages([*(self._infos[node] for node in pair.nodes), *sensed])
         seen = sights(readings, self._settings)
         # No marks went in: these are what the pictures show.
-        said = new_blinks(readings.marks, pair.blinks)
-        pair.blinks += said
+        said = new_blinks(readings.marks, self._blinks)
+        self._blinks += said
         for rest in rests(readings, seen, self._settings):
             known = next((one for one in pair.judged if _same(one.rest, rest)), None)
             if known is not None and (known is not pair.judged[-1] or rest.too_short):
@@ -189,7 +191,7 @@ class LiveLegs:
                     stamp_ns=now_ns,
                     kind=kind,
                     name=name,
-                    note=note,
+                    note=note if len(self._infos) < 3 else f"{'/'.join(pair.nodes)}: {note}",
                     leg_ns=one.start_ns,
                     earlier=earlier,
                 )
