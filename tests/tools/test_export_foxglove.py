@@ -17,6 +17,7 @@ from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from buddyline.tools.cli import main
 from mcap.decoder import DecoderFactory
 from mcap.records import Schema
+from msgspec.structs import replace
 
 from tests.tools.evaluated import INFOS, LEFT, RIGHT, frame, pose, rejection, track, write_log
 from tests.tools.watched import PNG, at, attitude, depth, image, solver_status, status
@@ -231,3 +232,19 @@ def test_a_track_moves_b_and_draws_its_path(tmp_path: Path) -> None:
     assert main(["export", dive, "--format", "foxglove", "--what", "poses", "-o", str(poses)]) == 0
     with open(poses, "rb") as file:
         assert "/pair/a/b/path" not in {c.topic for _, c, _ in make_reader(file).iter_messages()}
+
+
+def test_each_frame_of_a_team_has_one_parent(tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+
+    pairs = [("a", "b"), ("a", "d"), ("b", "c"), ("c", "d")]
+    seen = [replace(pose(k), node_a=one, node_b=two) for k in range(5) for one, two in pairs]
+    output = tmp_path / "foxglove.mcap"
+    dive = write_log(tmp_path / "dive.mcap", *INFOS.values(), *seen)
+    assert main(["export", dive, "--format", "foxglove", "-o", str(output)]) == 0
+    with open(output, "rb") as file:
+        reader = make_reader(file, decoder_factories=[decoding.DecoderFactory(), JsonDecoder()])
+        told = [tf for _, channel, _, tf in reader.iter_decoded_messages() if channel.topic == "/tf"]
+    links = {(t.parent_frame_id, t.child_frame_id) for tf in told for t in tf.transforms}
+    expected = {("world", "a_camera"), ("a_camera", "b_camera"), ("a_camera", "d_camera"), ("b_camera", "c_camera")}
+    assert links == expected

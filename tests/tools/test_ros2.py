@@ -14,7 +14,7 @@ from buddyline.protocol.clock import S_NS, ManualClock
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message, NodePose
 from buddyline.solver_service.geometry.rotation import quat_to_matrix
-from buddyline.tools.export.ros_messages import RosMessage, Translation, name_of, type_store
+from buddyline.tools.export.ros_messages import MAP, RosMessage, Translation, name_of, type_store
 from buddyline.tools.ros2 import RosGraph, attachment, dds_type
 from msgspec.structs import replace
 
@@ -146,6 +146,49 @@ def test_transforms_lead_from_the_map_to_b(store: Any) -> None:
     origin_m = np.array([0.0, 0.0, in_map.translation.z])
     b_m = origin_m + turned(in_map.rotation, (in_a.x, in_a.y, in_a.z))
     np.testing.assert_allclose(b_m, (3.0, 0.0, -12.5), atol=1e-9)
+
+
+def links(said: list[RosMessage]) -> list[tuple[str, str]]:
+    """Return parent and child of each transform."""
+    return [(t.header.frame_id, t.child_frame_id) for one in said if one.topic == "/tf" for t in one.value.transforms]
+
+
+def test_each_frame_of_a_team_has_one_parent(store: Any) -> None:
+    """B sees c before a sees b. D is seen by a and by c, at the end by c alone."""
+    pairs = [("b", "c"), ("a", "b"), ("a", "d"), ("c", "d")]
+    told: list[Message] = [INFOS["a"], INFOS["b"]]
+    for k in range(10):
+        told += [replace(pose(k), node_a=one, node_b=two) for one, two in pairs]
+        told += [attitude("b", at(k) + 1), attitude("a", at(k) + 2)]
+    early = links(translated(store, *told))
+    # Until a is seen to stand above it, b stands in the map.
+    assert set(early) == {
+        ("b_camera", "c_camera"),
+        ("a_camera", "b_camera"),
+        ("a_camera", "d_camera"),
+        (MAP, "a_camera"),
+    }
+    late = [replace(pose(k), node_a="c", node_b="d") for k in (20, 40)]
+    assert links(translated(store, *told, *late))[len(early) :] == [("c_camera", "d_camera")] * 2
+
+
+def test_a_net_places_its_nodes_and_stands_as_deep_as_their_gauges_say(store: Any) -> None:
+    places = [
+        NodePose(
+            net="main", node=node, stamp_ns=at(0), p_m=(0.0, north_m, 2.0), q_xyzw=(0.0, 0.0, 0.0, 1.0),
+            v_mps=(0.0, 0.0, 0.0), covariance=np.eye(6).ravel().tolist(), fixed=False, mode="filter", age_s=0.0,
+        )
+        for node, north_m in (("a", 0.0), ("b", 3.0))
+    ]  # fmt: skip
+    said = translated(
+        store, INFOS["a"], INFOS["b"], depth("b", at(0), 12.0), *places, pose(0), attitude("a", at(1)),
+        replace(pose(1), node_b="c"),
+    )  # fmt: skip
+    assert links(said) == [
+        ("net_main", "a_camera"), ("net_main", "b_camera"), (MAP, "net_main"), ("a_camera", "c_camera")
+    ]  # fmt: skip
+    net = [t for one in said if one.topic == "/tf" for t in one.value.transforms if t.header.frame_id == MAP]
+    assert net[0].transform.translation.z == -10.0
 
 
 def test_transforms_of_a_fast_sensor_are_thinned(store: Any) -> None:

@@ -1,4 +1,7 @@
-"""Where A's camera is in a world of east, north, up with its origin on the surface, for other programs' viewers."""
+"""Where A's camera is in a world of east, north, up with its origin on the surface, for other programs' viewers.
+
+Those viewers know one tree of frames. Of more than two nodes each may be placed by several others.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,34 @@ from numpy.typing import NDArray
 R_ENU_NED: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 # Least time between two transforms of A's camera: a viewer needs no more.
 SPACING_NS: Final = S_NS // 20
+# A parent that has not placed a frame for this time is its parent no longer.
+SILENT_NS: Final = S_NS
+
+
+class FrameTree:
+    """Which frame places which: a frame has one parent at a time, and none is above itself."""
+
+    def __init__(self) -> None:
+        self._placed: dict[str, tuple[str, int]] = {}
+
+    def parent(self, frame: str, now_ns: int) -> str | None:
+        """Return what has placed a frame lately; None for a root."""
+        parent, at_ns = self._placed.get(frame, ("", now_ns - 2 * SILENT_NS))
+        return parent if abs(now_ns - at_ns) <= SILENT_NS else None
+
+    def root(self, frame: str, now_ns: int) -> str:
+        """Return the frame above a frame that nothing has placed."""
+        while (parent := self.parent(frame, now_ns)) is not None:
+            frame = parent
+        return frame
+
+    def place(self, parent: str, frame: str, now_ns: int, *, first: bool = False) -> bool:
+        """Return whether the parent may place a frame now, and note that. first: it goes before any other parent."""
+        held = None if first else self.parent(frame, now_ns)
+        if held not in (None, parent) or self.root(parent, now_ns) == frame:
+            return False
+        self._placed[frame] = parent, now_ns
+        return True
 
 
 class BaseCamera:

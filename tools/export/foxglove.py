@@ -34,7 +34,7 @@ from buddyline.protocol.schemas import json_schema
 from buddyline.protocol.topics import TRACK, TRACK_LAG
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
 from buddyline.tools.dives import Dive
-from buddyline.tools.export.enu import R_ENU_NED, BaseCamera
+from buddyline.tools.export.enu import R_ENU_NED, BaseCamera, FrameTree
 from buddyline.tools.export.foxglove_layout import LOG, TRANSFORMS, WORLD, layout
 from buddyline.tools.extras import needed
 from buddyline.tools.health.words import Sayings
@@ -66,6 +66,7 @@ class FoxgloveTranslation:
         self._paths: dict[tuple[str, str], list[Track]] = {}
         self._frames: dict[str, deque[Candidates]] = {}
         self._camera = BaseCamera()
+        self._tree = FrameTree()
         self._sayings = Sayings()
 
     def start(self, infos: dict[str, NodeInfo], base: str | None, at_ns: int) -> Iterator[tuple[str, int, Any]]:
@@ -185,7 +186,7 @@ class FoxgloveTranslation:
         fox, stamp_ns = self._fox, pose.stamp_ns
         base, child = f"{pose.node_a}_camera", f"{pose.node_b}_camera"
         t_m, R = np.array(pose.t_a_b_m), quat_to_matrix(np.array(pose.q_a_b_xyzw))
-        if (pose.node_a, pose.node_b) not in self._tracked:
+        if (pose.node_a, pose.node_b) not in self._tracked and self._places(pose):
             yield TRANSFORMS, stamp_ns, self._transform(base, child, t_m, R, stamp_ns)
         placed = fox.PoseInFrame(
             timestamp=self._time(stamp_ns),
@@ -198,10 +199,16 @@ class FoxgloveTranslation:
             if frame is not None and max(chosen) < len(frame.blobs):
                 yield f"/{node}/camera/chosen", frame.stamp_ns, self._chosen(frame, chosen)
 
+    def _places(self, estimate: Track | RelativePose) -> bool:
+        """Return whether it places B: not where another pair does, nor the node that stands in the world."""
+        a, b = estimate.node_a, estimate.node_b
+        return b != self._camera.base and self._tree.place(a, b, estimate.stamp_ns)
+
     def _track(self, track: Track) -> Iterator[tuple[str, int, Any]]:
         base, child = f"{track.node_a}_camera", f"{track.node_b}_camera"
         t_m, R = np.array(track.t_a_b_m), quat_to_matrix(np.array(track.q_a_b_xyzw))
-        yield TRANSFORMS, track.stamp_ns, self._transform(base, child, t_m, R, track.stamp_ns)
+        if self._places(track):
+            yield TRANSFORMS, track.stamp_ns, self._transform(base, child, t_m, R, track.stamp_ns)
         piece = self._paths.setdefault((track.node_a, track.node_b), [])
         piece.append(track)
         if track.stamp_ns - piece[0].stamp_ns >= PATH_NS:

@@ -30,15 +30,13 @@ from buddyline.protocol.messages import (
 )
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
 from buddyline.tools.estimate import range_sigma_m
-from buddyline.tools.export.enu import R_ENU_NED, BaseCamera
+from buddyline.tools.export.enu import R_ENU_NED, SILENT_NS, BaseCamera, FrameTree
 from buddyline.tools.extras import needed
 from buddyline.tools.health.words import reason_words
 
 MAP: Final = "map"
 # builtin_interfaces/Time counts seconds in 32 bits, with a sign.
 END_OF_ROS_TIME_NS: Final = 2**31 * S_NS
-# After a track has been silent for this time, poses give B's transform again.
-TRACK_SILENT_NS: Final = S_NS
 # Between forward, left, up and forward, right, down: the matrix is its own inverse.
 R_FRD_FLU: Final = np.diag([1.0, -1.0, -1.0])
 # Variance of a field that was not measured: large, so that filters ignore the field.
@@ -83,6 +81,10 @@ class Translation:
         self._types = types
         self._camera = BaseCamera()
         self._tracked_ns: dict[tuple[str, str], int] = {}
+        self._tree = FrameTree()
+        self._based_ns = 0
+        # The node whose depth says how deep a net's zero is, by net.
+        self._sounded: dict[str, str] = {}
 
     def messages(self, message: Message) -> Iterator[RosMessage]:
         """Yield the ROS messages for one of our messages; raise MessageError where ROS cannot say its time."""
@@ -98,13 +100,11 @@ class Translation:
             self._camera.take(message)
             yield self._depth(message)
         elif isinstance(message, RelativePose):
-            self._camera.base = message.node_a
             yield from self._pose(message)
         elif isinstance(message, Track):
-            self._camera.base = message.node_a
             yield from self._track(message)
         elif isinstance(message, NodePose):
-            yield self._node_pose(message)
+            yield from self._node_pose(message)
         elif isinstance(message, CompressedImage):
             yield from self._picture(message)
         elif isinstance(message, Rejected):
@@ -206,7 +206,7 @@ class Translation:
     def _camera_in_map(self, attitude: Attitude) -> Iterator[RosMessage]:
         """Yield the transform of A's camera. B's follows from the pose, because a frame has only one parent."""
         R = self._camera.orientation(attitude)
-        if R is not None:
+        if R is not None and self._tree.parent(attitude.node, attitude.stamp_ns) is None:
             x, y, z = self._camera.position_m(attitude.node).tolist()
             yield self._transform(attitude.stamp_ns, MAP, f"{name_of(attitude.node)}_camera", (x, y, z), R)
 
@@ -223,9 +223,9 @@ class Translation:
         value = self._posed(pose.stamp_ns, f"{a}_camera", pose.t_a_b_m, R_a_b, np.array(pose.covariance))
         yield RosMessage(f"/buddyline/{a}/{b}/pose", POSE_TYPE, value)
         tracked_ns = self._tracked_ns.get((a, b))
-        if tracked_ns is None or abs(pose.stamp_ns - tracked_ns) > TRACK_SILENT_NS:
+        if tracked_ns is None or abs(pose.stamp_ns - tracked_ns) > SILENT_NS:
             yield self._range(pose)
-            yield self._transform(pose.stamp_ns, f"{a}_camera", f"{b}_camera", pose.t_a_b_m, R_a_b)
+            yield from self._placed(pose, R_a_b)
 
     def _track(self, track: Track) -> Iterator[RosMessage]:
         """Yield a track's sample as an odometry of B's camera, and on /tf the sample of the track that is not late.
@@ -244,22 +244,41 @@ class Translation:
         if not late:
             self._tracked_ns[a, b] = track.stamp_ns
             yield self._range(track)
-            yield self._transform(track.stamp_ns, f"{a}_camera", f"{b}_camera", track.t_a_b_m, R_a_b)
+            yield from self._placed(track, R_a_b)
 
-    def _node_pose(self, pose: NodePose) -> RosMessage:
-        """Return a node's pose in its net's frame, here east-north-up, as an odometry of its camera.
+    def _placed(self, estimate: Track | RelativePose, R_a_b: Any) -> Iterator[RosMessage]:
+        """Yield B's transform from A's camera, unless the net or another pair places B; A's root stands in the map."""
+        a, b, stamp_ns = estimate.node_a, estimate.node_b, estimate.stamp_ns
+        if not self._tree.place(a, b, stamp_ns):
+            return
+        root, base = self._tree.root(a, stamp_ns), self._camera.base
+        stands = base is not None and self._tree.parent(base, stamp_ns) is None
+        if root == base or not stands or abs(stamp_ns - self._based_ns) > SILENT_NS:
+            self._camera.base, self._based_ns = root, stamp_ns
+        yield self._transform(stamp_ns, f"{name_of(a)}_camera", f"{name_of(b)}_camera", estimate.t_a_b_m, R_a_b)
 
-        The velocity is in the camera's frame, without a covariance: NodePose has none.
+    def _node_pose(self, pose: NodePose) -> Iterator[RosMessage]:
+        """Yield a node's pose in its net's frame, here east-north-up, as an odometry of its camera and a transform.
+
+        The velocity is in the camera's frame, without a covariance: NodePose has none. The net's zero is as deep as one
+        of its nodes says.
         """
         net, node = name_of(pose.net), name_of(pose.node)
         R_net_camera = quat_to_matrix(np.array(pose.q_xyzw))
         x, y, z = (R_ENU_NED @ np.array(pose.p_m)).tolist()
         turn = np.kron(np.eye(2), R_ENU_NED)
         covariance = (turn @ np.array(pose.covariance).reshape(6, 6) @ turn.T).ravel()
-        placed = self._posed(pose.stamp_ns, f"net_{pose.net}", (x, y, z), R_ENU_NED @ R_net_camera, covariance)
+        frame = f"net_{pose.net}"
+        placed = self._posed(pose.stamp_ns, frame, (x, y, z), R_ENU_NED @ R_net_camera, covariance)
         velocity_mps, unknown = R_net_camera.T @ np.array(pose.v_mps), UNKNOWN_VARIANCE * np.eye(3)
         value = self._odometry(placed, f"{node}_camera", velocity_mps, unknown)
-        return RosMessage(f"/buddyline/net/{net}/{node}", ODOMETRY_TYPE, value)
+        yield RosMessage(f"/buddyline/net/{net}/{node}", ODOMETRY_TYPE, value)
+        # No node's id has a slash.
+        self._tree.place(f"net/{net}", pose.node, pose.stamp_ns, first=True)
+        yield self._transform(pose.stamp_ns, frame, f"{node}_camera", (x, y, z), R_ENU_NED @ R_net_camera)
+        above_m = float(self._camera.position_m(pose.node)[2])
+        if above_m and self._sounded.setdefault(net, pose.node) == pose.node:
+            yield self._transform(pose.stamp_ns, MAP, frame, (0.0, 0.0, above_m - z), np.eye(3))
 
     def _odometry(self, placed: Any, child: str, velocity_mps: Any, of_velocity: Any) -> Any:
         """Return the odometry of a child frame at a placed pose; its velocity and covariance are in that frame."""
