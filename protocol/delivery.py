@@ -12,6 +12,8 @@ from buddyline.protocol.clock import S_NS, Clock
 
 MAX_QUEUED_BYTES: Final = 64 * 1024 * 1024
 CLOSE_S: Final = 1.0
+# Of so many owners it is known in which queue their last item is.
+MAX_OWNERS: Final = 256
 # Of each key, the messages of a minute at 30 Hz.
 MAX_KNOWN: Final = 2048
 MAX_KNOWN_KEYS: Final = 512
@@ -68,8 +70,9 @@ class Delivery(Generic[T]):
     """Bounded queues, and the thread that passes their items to one handler.
 
     Queues take turns: a sender of more than can be handled delays and loses what is in its own queue. Items of a queue
-    come in order; the queue "" comes before all others. Of a queue that is full (`capacity` items) the oldest item is
-    dropped; of all together beyond MAX_QUEUED_BYTES, that of the largest. `dropped` counts them.
+    come in order, and so do those of an owner: while its last item may wait in another queue, the next waits there too.
+    The queue "" comes before all others. Of a queue that is full (`capacity` items) the oldest item is dropped; of all
+    together beyond MAX_QUEUED_BYTES, that of the largest. `dropped` counts them.
     """
 
     def __init__(self, name: str, handle: Callable[[T], None], capacity: int, failures: FailureLatch) -> None:
@@ -81,17 +84,21 @@ class Delivery(Generic[T]):
         self._failures = failures
         # By name; the one whose turn is next is first. None is empty.
         self._queues: OrderedDict[str, _Queue[T]] = OrderedDict()
+        # By owner, the queue of its last item.
+        self._queue_of: OrderedDict[str, str] = OrderedDict()
         self._bytes = 0
         self._closing = False
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
-    def offer(self, item: T, size_bytes: int = 0, queue: str = "") -> None:
-        """Queue an item; never waits."""
+    def offer(self, item: T, size_bytes: int = 0, queue: str = "", owner: str = "") -> None:
+        """Queue an item; never waits. owner: "" for none."""
         with self._changed:
             if self._closing:
                 return
+            if owner:
+                queue = self._behind_others(queue, owner)
             into = self._queues.setdefault(queue, _Queue())
             into.items.append((item, size_bytes))
             into.bytes += size_bytes
@@ -144,6 +151,14 @@ class Delivery(Generic[T]):
         if name in self._queues:
             self._queues.move_to_end(name)
         return item
+
+    def _behind_others(self, queue: str, owner: str) -> str:
+        """Return the queue where an owner's next item comes after its others; those in "" come first anyway."""
+        before = self._queue_of.pop(owner, "")
+        self._queue_of[owner] = queue = before if before and before in self._queues else queue
+        if len(self._queue_of) > MAX_OWNERS:
+            self._queue_of.popitem(last=False)
+        return queue
 
     def _take(self, name: str) -> T:
         """Take the oldest item of a queue; a queue without items is forgotten."""

@@ -22,6 +22,7 @@ from buddyline.protocol.bus import (
 )
 from buddyline.protocol.clock import Clock, SystemClock
 from buddyline.protocol.delivery import Delivery, RateCap, Repeats
+from buddyline.protocol.sequence import owner_of
 from buddyline.protocol.topics import Topic
 
 
@@ -135,7 +136,8 @@ class LocalSubscription:
             return
         now_ns = self._network.clock.now_ns()
         received = Received(publisher.key, payload, now_ns, publisher.topic.encoding)
-        self._delivery.offer(received, len(payload), queue_of(publisher.key, payload, now_ns) if self.joined else "")
+        queue = queue_of(publisher.key, payload, now_ns) if self.joined else ""
+        self._delivery.offer(received, len(payload), queue, owner_of(publisher.key))
 
     def close(self) -> None:
         """Let the handler finish the queued messages, for one second at most, and end its thread."""

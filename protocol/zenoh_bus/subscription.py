@@ -269,7 +269,7 @@ class ZenohSubscription:
             return
         received = Received(key=key, payload=payload, receive_ns=self._clock.now_ns(), encoding=arrived.encoding)
         queue = queue_of(received.key, received.payload, received.receive_ns) if self._joined else ""
-        self._delivery.offer(received, len(received.payload), queue)
+        self._delivery.offer(received, len(received.payload), queue, arrived.source.owner)
 
 
 def _arrived(sample: zenoh.Sample) -> Arrived:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 
 import pytest
 from buddyline.protocol import topics
-from buddyline.protocol.clock import ManualClock
+from buddyline.protocol.bus import Received
+from buddyline.protocol.clock import S_NS, ManualClock
 from buddyline.protocol.codec import decode, encode, payload_stamp_ns
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.local_bus import key_matches
 from buddyline.protocol.messages import CompressedImage, Depth, FoxgloveTime, NodeStatus, Rejected
 
-from tests.processes import until
+from tests.processes import PATIENCE_S, until
 from tests.protocol.buses import NOW_NS, Connect, depth, rejected, status, triggers, wait_until_heard
 from tests.protocol.inbox import Inbox
 
@@ -44,6 +46,26 @@ def test_a_publishers_messages_come_in_order_and_once(client: Connect) -> None:
         publisher.put(rejected(trigger))
     inbox.wait_for(500)
     assert triggers(inbox) == list(range(500))
+
+
+def test_what_was_held_up_for_more_than_a_minute_comes_before_what_is_newer(client: Connect) -> None:
+    """Else a node whose link was cut for so long would seem to set its clock back and forth."""
+    begun, go_on, inbox = threading.Event(), threading.Event(), Inbox()
+
+    def handle(received: Received) -> None:
+        begun.set()
+        assert go_on.wait(PATIENCE_S)
+        inbox(received)
+
+    client().subscribe(topics.DEPTH.key_any(), handle)
+    publisher = client().publisher(topics.DEPTH, "a")
+    stamps_ns = [NOW_NS - seconds * S_NS for seconds in range(120, 0, -1)]
+    for stamp_ns in stamps_ns:
+        publisher.put(depth(stamp_ns))
+    assert begun.wait(PATIENCE_S)
+    wait_until_heard(client(), topics.DEPTH.key_any(), len(stamps_ns))
+    go_on.set()
+    assert [decode(received.payload, Depth).stamp_ns for received in inbox.wait_for(len(stamps_ns))] == stamps_ns
 
 
 def test_a_late_joiner_gets_the_history_before_new_messages(client: Connect) -> None:
