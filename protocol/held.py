@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import bisect
+import math
 import threading
 from collections import deque
 from collections.abc import Iterable, Iterator
@@ -28,26 +30,40 @@ class HeldMessage(NamedTuple):
 
 
 class Held:
-    """The newest messages of a publisher, numbered one by one. Safe to use from several threads."""
+    """The newest messages of a publisher, numbered one by one. Safe to use from several threads.
 
-    def __init__(self, depth: int) -> None:
+    history_s: who has heard nothing of the publisher yet gets what was added in this time; who has missed something
+    gets all that is held, which is of more time where messages are rare.
+    """
+
+    def __init__(self, depth: int, history_s: float = math.inf) -> None:
         self._depth = depth
+        self._history_s = history_s
         self._messages: deque[HeldMessage] = deque()
+        self._added_s: deque[float] = deque()
         self._bytes = 0
         self._lock = threading.Lock()
 
-    def add(self, message: HeldMessage) -> None:
-        """Hold a message; let go of the oldest beyond the depth or MAX_HELD_BYTES."""
+    def add(self, message: HeldMessage, now_s: float = 0.0) -> None:
+        """Hold a message; let go of the oldest beyond the depth or MAX_HELD_BYTES. now_s: monotonic."""
         with self._lock:
             self._messages.append(message)
+            self._added_s.append(now_s)
             self._bytes += len(message.payload)
             while len(self._messages) > self._depth or self._bytes > MAX_HELD_BYTES:
                 self._bytes -= len(self._messages.popleft().payload)
+                self._added_s.popleft()
 
-    def find(self, first: int, last: int) -> tuple[int, list[HeldMessage]]:
-        """Return the number of the oldest message that is held, and those from `first` to `last`."""
+    def find(self, first: int, last: int, now_s: float = 0.0) -> tuple[int, list[HeldMessage]]:
+        """Return the number of the oldest message that there is, and those from `first` to `last`.
+
+        Who asks from 0 on knows nothing of this publisher.
+        """
         with self._lock:
             oldest = self._messages[0].number if self._messages else 0
+            if first == 0:
+                passed = bisect.bisect_left(self._added_s, now_s - self._history_s)
+                return oldest + passed, list(islice(self._messages, passed, max(last + 1 - oldest, passed)))
             return oldest, list(islice(self._messages, max(first - oldest, 0), max(last + 1 - oldest, 0)))
 
 

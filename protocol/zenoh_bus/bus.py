@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import math
 import threading
 import time
 from collections import deque
@@ -76,7 +77,8 @@ class ZenohPublisher(Publisher):
 
     budget: decides what a slow link carries. hurry: is called after each message of a prompt topic, with what its copy
     says of its source.
-    desk: answers those that missed a message, from the last `depth` of them (0: images, of which none is held).
+    desk: answers those that missed a message, from the last `depth` of them (0: images, of which none is held), and
+    those that come new, from the last `history_s`.
     answer_in: the session in which a plain `get` is answered with the last message; None: it is not answered here.
     """
 
@@ -90,13 +92,14 @@ class ZenohPublisher(Publisher):
         hurry: Callable[[bytes, zenoh.SourceInfo], None],
         desk: HeldDesk,
         depth: int,
+        history_s: float,
         answer_in: zenoh.Session | None = None,
     ) -> None:
         super().__init__(topic, key, cap)
         self._budget = budget
         self._hurry = hurry
         self._desk = desk
-        self._held = Held(depth) if depth else None
+        self._held = Held(depth, history_s) if depth else None
         self._count = 0
         self._declare = declare
         self._last: bytes | None = None
@@ -120,7 +123,7 @@ class ZenohPublisher(Publisher):
             if self._publisher is None:
                 return False
             if self._held is not None:
-                self._held.add(HeldMessage(self._count, payload, again))
+                self._held.add(HeldMessage(self._count, payload, again), time.monotonic())
             self._publisher.put(payload, attachment=AGAIN if again else None)
             self._last = payload
             if self.topic.prompt:
@@ -210,7 +213,8 @@ class ZenohBus(Bus):
         # What the hub retains is answered by the hub.
         answer_in = self._session if topic.latest_only and not topic.retained else None
         cap = RateCap(max_rate_hz, self.clock)
-        wrapped = ZenohPublisher(declare, topic, key, cap, self._budget, hurry, self._held, depth, answer_in)
+        history_s = math.inf if topic.latest_only else self._cache_s
+        wrapped = ZenohPublisher(declare, topic, key, cap, self._budget, hurry, self._held, depth, history_s, answer_in)
         with self._lock:
             self._publishers.append(wrapped)
         return wrapped

@@ -57,7 +57,7 @@ class _AskedFor:
     _pages: Iterator[tuple[bytes, int]] = field(init=False)
 
     def __post_init__(self) -> None:
-        oldest, messages = self.shelf.held.find(*asked(str(self.query.parameters)))
+        oldest, messages = self.shelf.held.find(*asked(str(self.query.parameters)), self.since_s)
         self.count = len(messages)
         self.sent_from = messages[-1].number + 1 if messages else oldest
         self._pages = pages(oldest, reversed(messages))

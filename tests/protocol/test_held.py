@@ -71,6 +71,19 @@ def test_the_newest_are_held_up_to_the_depth_and_to_a_size() -> None:
     assert [message.number for message in large.find(0, 100)[1]] == list(range(90, 100))
 
 
+def test_who_comes_new_gets_a_minute_and_who_missed_something_all_that_is_held() -> None:
+    """At 5 Hz there are six minutes. A solver that joined got the older part of them first, for seconds."""
+    held = Held(1800, history_s=60.0)
+    for number in range(2000):
+        held.add(HeldMessage(number, b"x", again=False), number / 5.0)
+    oldest, found = held.find(*asked(""), 400.0)
+    assert (oldest, [message.number for message in found]) == (1700, list(range(1700, 2000)))
+    assert held.find(0, 1749, 400.0) == (1700, found[:50])
+    assert held.find(0, 1000, 400.0) == (1700, [])
+    oldest, found = held.find(300, 1999, 400.0)
+    assert (oldest, [message.number for message in found]) == (200, list(range(300, 2000)))
+
+
 @pytest.mark.parametrize(
     ("text", "numbers"),
     [
