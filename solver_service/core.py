@@ -271,7 +271,7 @@ class SolverCore:
             if now_ns is not None:
                 self.health.saw_frame(stream.node, message.stamp_ns, now_ns)
             seen_ns = message.stamp_ns if now_ns is None else now_ns
-            self.health.saw_run(stream.node, message.boot, message.stamp_ns, seen_ns)
+            self.health.saw_run(message, seen_ns, is_second=arrival is Arrival.CONFLICT)
             for pair in self._pairs_of.get(stream.node, ()):
                 pair.take(message, arrival, now_ns, live=live)
         else:

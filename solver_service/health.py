@@ -9,11 +9,12 @@ from typing import Final
 from buddyline.protocol import __version__
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.health import FRAMES_APART_S, stale_after_s
-from buddyline.protocol.messages import Blink
+from buddyline.protocol.messages import Blink, Candidates
 from buddyline.protocol.topics import CANDIDATES
 
 MAX_PROCESSES: Final = 256
-# Frames of two runs of a node that come by turns so often are two nodes' of one id; it is said for TWINS_NS after that.
+# Frames of two runs of a node, or of two counts in one run, that come by turns so often are two nodes' of one id; it is
+# said for TWINS_NS after that.
 TWINS: Final = 3
 TWINS_NS: Final = 10 * S_NS
 _RELEASE: Final = re.compile(r"buddyline (\d{1,4}\.\d{1,4})(?!\d)")
@@ -21,14 +22,15 @@ _RELEASE: Final = re.compile(r"buddyline (\d{1,4}\.\d{1,4})(?!\d)")
 
 @dataclass
 class Runs:
-    """The run (boot) that a node's newest frame is of, that frame's stamp, and the run before.
+    """The run (boot) that a node's newest frame is of, its stamp, the number that came last, and the run before.
 
-    returns: how often the run before was back, later by stamp. now_ns: when it was last. twins: whether it ever was so
-    often that there were two nodes.
+    returns: how often the run before, or an earlier number of this one, was back, later by stamp. now_ns: when it was
+    last. twins: whether it ever was so often that there were two nodes.
     """
 
     boot: str
     stamp_ns: int
+    seq: int
     before: str | None = None
     returns: int = 0
     now_ns: int = 0
@@ -54,19 +56,25 @@ class Health:
         """Note a node's trigger period."""
         self._period_s[node] = trigger_period_ns / S_NS
 
-    def saw_run(self, node: str, boot: str, stamp_ns: int, now_ns: int) -> None:
-        """Note which run of a node a frame is of. A node that starts again leaves its run before for good."""
-        runs = self._runs.setdefault(node, Runs(boot, stamp_ns))
-        if stamp_ns < runs.stamp_ns:
-            return
-        if boot != runs.boot:
-            if boot == runs.before:
-                runs.returns, runs.now_ns = runs.returns + 1, now_ns
-                runs.twins |= runs.returns >= TWINS
-            else:
+    def saw_run(self, frame: Candidates, now_ns: int, *, is_second: bool = False) -> None:
+        """Note which run of a node a frame is of. A node that starts again leaves its run before for good.
+
+        is_second: whether another frame of this node has its trigger. A node whose clock is set back counts on.
+        """
+        boot, stamp_ns, seq = frame.boot, frame.stamp_ns, frame.seq
+        runs = self._runs.setdefault(frame.node, Runs(boot, stamp_ns, seq))
+        is_newer = stamp_ns >= runs.stamp_ns
+        counts_back = boot == runs.boot and (seq <= runs.seq if is_second else is_newer and seq < runs.seq)
+        if counts_back or (is_newer and boot == runs.before):
+            runs.returns, runs.now_ns = runs.returns + 1, now_ns
+            runs.twins |= runs.returns >= TWINS
+        if boot == runs.boot:
+            runs.seq = seq
+        elif is_newer:
+            if boot != runs.before:
                 runs.returns = 0
-            runs.boot, runs.before = boot, runs.boot
-        runs.stamp_ns = stamp_ns
+            runs.boot, runs.before, runs.seq = boot, runs.boot, seq
+        runs.stamp_ns = max(stamp_ns, runs.stamp_ns)
 
     def saw_blink(self, node: str, blink: Blink | None) -> None:
         """Note how a node's lamp blinks, None where it does not."""
@@ -96,12 +104,8 @@ class Health:
     def problems(self, nodes: tuple[str, str], now_ns: int) -> list[str]:
         """Return the problems of a pair of nodes, one phrase each."""
         found = [text for node in nodes if (text := self._problem_of(node, now_ns))]
-        own = release_of(f"buddyline {__version__}")
-        others = [
-            f"node {node} runs Buddyline {release}, this solver {own}: update the older"
-            for node in nodes
-            if (release := self._releases.get(node)) is not None and own is not None and release != own
-        ]
+        own, releases = self._other_releases(nodes)
+        others = [f"node {node} runs Buddyline {its}, this solver {own}: update the older" for node, its in releases]
         if not found:
             node_a, node_b = nodes
             ahead_ns = self._frames[node_b][1] - self._frames[node_a][1]
@@ -115,9 +119,17 @@ class Health:
         return found + others + twins + self._one_code(nodes)
 
     def of_dive(self, nodes: tuple[str, str]) -> list[str]:
-        """Return what a dive that is over told of a pair of nodes: two have one id, or one code."""
+        """Return what a dive that is over told of a pair of nodes: two have one id, one code, or another release."""
         twins = [node for node in nodes if (runs := self._runs.get(node)) is not None and runs.twins]
-        return [*map(_twins_text, twins), *self._one_code(nodes)]
+        own, releases = self._other_releases(nodes)
+        others = [f"node {node} ran Buddyline {its}, this is {own}" for node, its in releases]
+        return [*map(_twins_text, twins), *self._one_code(nodes), *others]
+
+    def _other_releases(self, nodes: tuple[str, str]) -> tuple[str | None, list[tuple[str, str]]]:
+        """Return the release of this program, and which nodes run another."""
+        own = release_of(f"buddyline {__version__}")
+        found = [(node, self._releases[node]) for node in nodes if node in self._releases and own is not None]
+        return own, [(node, its) for node, its in found if its != own]
 
     def _twins(self, node: str, now_ns: int) -> bool:
         runs = self._runs.get(node)

@@ -59,6 +59,7 @@ def test_what_comes_is_told_before_it_waits_for_the_handler(client: Connect) -> 
 
     publisher = node.publisher(topics.REJECTED, "a", "b")
     publisher.put(rejected(0))
+    wait_until_heard(client(), topics.REJECTED.key_any(), 1)
     bus.subscribe("buddyline/pair/*/*/rejected", slow, on_arrival=lambda key, payload: arrived.append((key, payload)))
     # What was held has come, too.
     assert [key for key, _ in arrived] == [publisher.key]

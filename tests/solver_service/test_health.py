@@ -6,9 +6,11 @@ import time
 import pytest
 from buddyline.protocol.codec import decode, encode
 from buddyline.protocol.local_bus import LocalNetwork
-from buddyline.protocol.messages import Blink, NodeInfo
+from buddyline.protocol.messages import Blink, Candidates, NodeInfo
 from buddyline.protocol.topics import INFO, SOLVER_STATUS
 from buddyline.solver_service.config import SolverConfig
+from buddyline.solver_service.core import SolverCore
+from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.health import Health
 from buddyline.solver_service.service import SolverService
 from msgspec.structs import replace
@@ -18,6 +20,7 @@ from tests.solver_service.conftest import dive_messages
 
 S_NS = 1_000_000_000
 AB = ("a", "b")
+TWINS_OF_B = "two nodes have the id b: give each its own"
 
 
 @pytest.fixture
@@ -64,20 +67,45 @@ def test_clocks_that_disagree_are_named_with_their_difference(health, ahead_s, f
     assert said.startswith(f"frames of {first} are {abs(ahead_s):.1f} s ahead of those of {second}")
 
 
+def frame(node, boot, seq, seconds):
+    stamp_ns = round(seconds * S_NS)
+    trigger = round(seconds * 10)
+    return Candidates(
+        node=node, boot=boot, seq=seq, stamp_ns=stamp_ns, trigger=trigger, width_px=820, height_px=616, blobs=[]
+    )
+
+
 def test_two_nodes_of_one_id_are_named_while_both_send(health):
     """A node that starts again, and whose earlier frames come late, is one node."""
     for k in range(8):
-        health.saw_run("a", "first", (100 + k) * S_NS, now_ns=50 * S_NS)
+        health.saw_run(frame("a", "first", k, 100 + k), now_ns=50 * S_NS)
     for k in range(8):
-        health.saw_run("a", "second", (110 + k) * S_NS, now_ns=50 * S_NS)
-        health.saw_run("a", "first", (109 - k) * S_NS, now_ns=50 * S_NS)
+        health.saw_run(frame("a", "second", k, 110 + k), now_ns=50 * S_NS)
+        health.saw_run(frame("a", "first", 9 - k, 109 - k), now_ns=50 * S_NS)
     assert health.problems(AB, 50500 * S_NS // 1000) == []
     for k in range(6):
-        health.saw_run("b", ("first", "second")[k % 2], (100 + k) * S_NS, now_ns=50 * S_NS)
-    assert health.problems(AB, 50500 * S_NS // 1000) == ["two nodes have the id b: give each its own"]
+        health.saw_run(frame("b", ("first", "second")[k % 2], k, 100 + k), now_ns=50 * S_NS)
+    assert health.problems(AB, 50500 * S_NS // 1000) == [TWINS_OF_B]
     assert "two nodes" not in "".join(health.problems(AB, 70 * S_NS))
     # A dive that is over is judged as a whole.
-    assert health.of_dive(AB) == ["two nodes have the id b: give each its own"]
+    assert health.of_dive(AB) == [TWINS_OF_B]
+
+
+@pytest.mark.parametrize(("other_seq", "later_s"), [(500, 0.01), (500, -0.01), (5, 0.01), (5, -0.01), (40, 0.01)])
+def test_two_nodes_of_one_id_and_one_boot_are_named(other_seq, later_s):
+    """Whichever counts farther, and whichever is exposed first. One whose clock is set back is no second one."""
+    core = SolverCore(Settings())
+    for node in AB:
+        for k in range(20):
+            core.handle(frame(node, "boot", 40 + k, 100 + k / 10), (100 + k // 10) * S_NS)
+    for k in range(10):
+        core.handle(frame("a", "boot", 60 + k, 101 + k / 10), 102 * S_NS)
+    assert core.health.of_dive(AB) == []
+    for k in range(6):
+        for seq, at_s in ((40 + k, 104), (other_seq + k, 104 + later_s)):
+            core.handle(frame("b", "boot", 20 + seq, at_s + k / 10), 104 * S_NS)
+    assert core.health.of_dive(AB) == [TWINS_OF_B]
+    assert TWINS_OF_B in core.health.problems(AB, 105 * S_NS)
 
 
 def test_nodes_that_blink_by_one_code_are_named(health):
@@ -151,3 +179,5 @@ def test_a_node_of_another_release_is_named(health, monkeypatch):
     assert health.problems(AB, 50 * S_NS) == []
     health.saw_software("b", "buddyline 0.1.9")
     assert health.problems(AB, 50 * S_NS) == ["node b runs Buddyline 0.1, this solver 0.2: update the older"]
+    # Out of the logs, too.
+    assert health.of_dive(AB) == ["node b ran Buddyline 0.1, this is 0.2"]
