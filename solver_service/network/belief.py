@@ -74,14 +74,16 @@ class NetBelief:
     """The state and covariance of all members, moved on by inertial samples and updated by the nodes' own sensors.
 
     intake: what all nodes have told. places: of the fixed nodes, by index. shaken: logs (2,) of the variances of nodes'
-    shaking, where an earlier pass has told them. members, state, covariance, rates_radps, shaking and t_s: as they are
-    now. trail: what led there, None where nothing is smoothed.
+    shaking, where an earlier pass has told them. walked: how far the units' biases walk, over what Noise has. members,
+    state, covariance, rates_radps, shaking and t_s: as they are now. trail: what led there, None where nothing is
+    smoothed.
     """
 
     def __init__(self, intake: TrackIntake) -> None:
         self.intake = intake
         self.places: dict[int, KnownPlace] = {}
         self.shaken: dict[int, Floats] = {}
+        self.walked = 1.0
         self.members: list[Member] = []
         self.state: NetState | None = None
         self.covariance: Floats = np.zeros((0, 0))
@@ -190,6 +192,9 @@ class NetBelief:
 
     def _noise_of(self, node: int, t_s: float) -> Noise:
         noise = self.intake.samples[node].noise(t_s)
+        if self.walked != 1.0:
+            gyro, accel = self.walked * noise.gyro_bias_radps, self.walked * noise.accel_bias_mps2
+            noise = replace(noise, gyro_bias_radps=gyro, accel_bias_mps2=accel)
         stated = self.intake.turning[node].stated(t_s)
         return noise if stated is None else replace(noise, gap_tilt_rad=stated[0], gap_heading_rad=stated[1])
 

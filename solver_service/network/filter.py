@@ -47,8 +47,12 @@ CONTRADICTIONS: Final = 10
 MEMORY_S: Final = 30.0
 # Rows are smoothed by what comes in this time after them at least, and in twice this time at most.
 LATER_S: Final = 10.0
-# How the units are shaken is learned from so much of a dive's beginning before what is smoothed begins.
+# How the units are shaken, and how far their biases walk, is learned from so much of a dive's beginning before what is
+# smoothed begins.
 REHEARSED_S: Final = 20.0
+# How far biases may walk, over what Noise has: as those of poor units, as those of good ones, and between. What
+# explains the dive's beginning better counts more.
+WALKS: Final = np.array((2.0, 0.8, 0.32))
 # Rows come after all else of their time.
 ROW: Final = 1 << 20
 
@@ -138,20 +142,29 @@ class NetFilter(TrackIntake):
         return self._go_on(self._end_s) + self._smooth(np.inf) if self.smooths else []
 
     def _rehearse(self) -> None:
-        """Learn how the units are shaken from the dive's beginning, whose own rows need it already."""
+        """Learn how the units are shaken and biases walk from the dive's beginning, whose own rows need it already."""
         self._rehearses = False
         if not self._events:
             return
+        trials = [self._trial(float(walked)) for walked in WALKS]
+        evidence = np.array([trial.evidence for trial in trials])
+        weights = np.exp(evidence - evidence.max())
+        best = trials[evidence.argmax()]
+        learned = zip(best.members, best.shaking.logs, strict=True)
+        self.main.shaken = {member.node: logs for member, logs in learned}
+        self.main.walked = float(np.exp(weights @ np.log(WALKS) / weights.sum()))
+
+    def _trial(self, walked: float) -> NetEstimate:
+        """Return where the dive's beginning leads if biases walk so far."""
         trial = copy.copy(self)
         trial.smooths, trial.main = False, self.main.copied()
-        trial.main.trail = None
+        trial.main.trail, trial.main.walked = None, walked
         trial.challengers, trial._watches, trial._problems = [], {}, Problems()
         trial._fixes, trial._challenged_s, trial._contradicted = {}, {}, {}
         trial._rejected = self._rejected.copy()
         trial._events = sorted(event for event in self._events if event[1] != ROW)
         trial._go_on(self._events[0][0] + REHEARSED_S)
-        learned = zip(trial.main.members, trial.main.shaking.logs, strict=True)
-        self.main.shaken = {member.node: logs for member, logs in learned}
+        return trial.main
 
     def _rows(self, t_s: float, stamp_ns: int) -> list[NetRow]:
         if not self.smooths:

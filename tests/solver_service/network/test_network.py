@@ -16,6 +16,7 @@ from buddyline.solver_service.config import SolveConfig, track_settings
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, rotation_log
 from buddyline.solver_service.network import filter as filter_module
+from buddyline.solver_service.network.estimate import NetEstimate
 from buddyline.solver_service.network.filter import NetFilter
 from buddyline.solver_service.tracking import PairTracker
 from msgspec.structs import replace
@@ -121,6 +122,34 @@ def test_the_smoothed_rows_of_the_beginning_count_what_the_dive_tells_of_shaking
     untold = sigma_rad(solved(messages, mode="smooth")[0])
     assert told.keys() == untold.keys()
     assert all(told[node] < 0.97 * untold[node] for node in told)
+
+
+@pytest.mark.parametrize(
+    ("evidence", "walked"), [((0.0, 0.0, 0.0), 0.8), ((-90.0, 0.0, 0.0), 0.506), ((9.0, 0.0, -9.0), 2.0)]
+)
+def test_walks_count_by_how_well_they_explain_the_dives_beginning(
+    evidence: tuple[float, ...], walked: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    net = NetFilter(smooths=True)
+
+    def trial(_: NetFilter, of: float) -> NetEstimate:
+        found = NetEstimate(net)
+        found.evidence = dict(zip(filter_module.WALKS.tolist(), evidence, strict=True))[of]
+        return found
+
+    monkeypatch.setattr(NetFilter, "_trial", trial)
+    net.advance(START_NS, [START_NS])
+    net.finish()
+    assert net.main.walked == pytest.approx(walked, rel=1e-3)
+    assert net.main.copied().walked == net.main.walked
+
+
+@pytest.mark.slow
+def test_a_dive_with_steady_units_tells_that_their_biases_hardly_walk() -> None:
+    _, messages = dive(7501, 10.0, inertial="good")
+    core = solved(messages, mode="smooth")[1]
+    assert core.network is not None
+    assert core.network._filter.main.walked < 0.5
 
 
 def sigma_rad(poses: list[NodePose]) -> dict[str, float]:
