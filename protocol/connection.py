@@ -8,6 +8,7 @@ import os
 import socket
 import struct
 import termios
+from collections.abc import Iterator
 from typing import Final, NamedTuple, Self
 
 _DESCRIPTORS: Final = "/proc/self/fd"
@@ -46,23 +47,10 @@ class Connection:
     @classmethod
     def find(cls, host: str, port: int) -> Self | None:
         """Return this process's connection with the local address host:port; None if there is none, or no /proc."""
-        try:
-            descriptors = os.listdir(_DESCRIPTORS)
-        except OSError:
-            return None
-        for descriptor in descriptors:
-            try:
-                if not os.readlink(f"{_DESCRIPTORS}/{descriptor}").startswith("socket:"):
-                    continue
-                # A copy, because closing it must not close the owner's descriptor.
-                connection = socket.socket(fileno=os.dup(int(descriptor)))
-            except OSError:
-                # The descriptor was closed meanwhile.
-                continue
+        for connection in _connections():
             with contextlib.suppress(OSError):  # its kind of socket has no address
-                if connection.type == socket.SOCK_STREAM and connection.getsockname()[:2] == (host, port):
-                    return cls(connection)
-            connection.close()
+                if connection.getsockname()[:2] == (host, port):
+                    return cls(socket.socket(fileno=os.dup(connection.fileno())))
         return None
 
     def hold_back(self, waiting_bytes: int) -> None:
@@ -115,6 +103,37 @@ class Connection:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def close_without_wait() -> None:
+    """Let no later close of a connection of this process wait for what is not sent; the kernel goes on to send it.
+
+    Zenoh (1.10) closes with SO_LINGER of ten seconds, in the few threads that receive for all connections: one link
+    that is cut would hold up all others for that time.
+    """
+    for connection in _connections():
+        with contextlib.suppress(OSError):
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
+
+
+def _connections() -> Iterator[socket.socket]:
+    """Yield a copy of each TCP socket of this process, and close it afterwards; none if there is no /proc."""
+    try:
+        descriptors = os.listdir(_DESCRIPTORS)
+    except OSError:
+        return
+    for descriptor in descriptors:
+        try:
+            if not os.readlink(f"{_DESCRIPTORS}/{descriptor}").startswith("socket:"):
+                continue
+            # A copy, because closing it must not close the owner's descriptor.
+            connection = socket.socket(fileno=os.dup(int(descriptor)))
+        except OSError:
+            # The descriptor was closed meanwhile.
+            continue
+        with connection:
+            if connection.type == socket.SOCK_STREAM and connection.family in (socket.AF_INET, socket.AF_INET6):
+                yield connection
 
 
 def _field(info: bytes, place: tuple[int, str]) -> int:

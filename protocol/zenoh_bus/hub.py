@@ -9,6 +9,8 @@ from types import TracebackType
 from typing import Final, Self
 
 import zenoh
+from buddyline.protocol.connection import close_without_wait
+from buddyline.protocol.delivery import CLOSE_S
 from buddyline.protocol.endpoint import DEFAULT_ENDPOINT
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.security import Tls
@@ -21,6 +23,8 @@ MAX_RETAINED: Final = 512
 MAX_RETAINED_BYTES: Final = 65536
 REOPEN_ATTEMPTS: Final = 20
 REOPEN_S: Final = 0.1
+# Shorter than the lease, after which a silent client's connection is closed.
+LOOK_S: Final = 0.5
 
 
 class Retained:
@@ -64,6 +68,13 @@ class Hub:
         self._tls = tls
         self._session = zenoh.open(config_of(hub_settings(endpoint, tls, access)))
         self._retained = Retained(self._session)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="hub connections", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stop.wait(LOOK_S):
+            close_without_wait()
 
     def admit(self, access: dict[str, object]) -> None:
         """Take other access rules: all clients are cut off, and those that are still admitted come back by themselves.
@@ -86,6 +97,8 @@ class Hub:
 
     def close(self) -> None:
         """Stop listening."""
+        self._stop.set()
+        self._thread.join(CLOSE_S)
         self._session.close()  # type: ignore[no-untyped-call]
 
     def __enter__(self) -> Self:

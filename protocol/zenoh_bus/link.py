@@ -9,7 +9,7 @@ import time
 from typing import Final
 
 import zenoh
-from buddyline.protocol.connection import Connection
+from buddyline.protocol.connection import Connection, close_without_wait
 from buddyline.protocol.delivery import CLOSE_S
 from buddyline.protocol.link_budget import LinkBudget
 from buddyline.protocol.zenoh_bus.session import SecondLink
@@ -89,6 +89,7 @@ class Link:
 
     def _follow(self, connection: Connection) -> None:
         connection.hold_back(AHEAD_BYTES)
+        close_without_wait()
         self.is_long = False
         self._budget.forget(time.monotonic())
         read, changed_s = -1, time.monotonic()
@@ -139,6 +140,7 @@ class Bulk:
             self._found_s = now_s
             with contextlib.suppress(zenoh.ZError):
                 self._connection = _connection(self._link.session)
+                close_without_wait()
         return self._before + self._of_this
 
     def is_sent(self) -> bool:

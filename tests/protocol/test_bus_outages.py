@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import socket
@@ -18,7 +19,8 @@ from buddyline.protocol import topics
 from buddyline.protocol.connection import Connection
 from buddyline.protocol.service import JOIN_TIMEOUT_S
 from buddyline.protocol.zenoh_bus import watchdog
-from buddyline.protocol.zenoh_bus.session import RETRY_S
+from buddyline.protocol.zenoh_bus.session import RETRY_S, config_of
+from buddyline.protocol.zenoh_bus.settings import client_settings
 
 from tests.processes import PATIENCE_S, free_endpoint, until
 from tests.protocol.buses import numbers, run_client
@@ -208,3 +210,49 @@ def test_only_the_given_connection_is_cut() -> None:
             for end in ends:
                 end.close()
         assert Connection.find("127.0.0.1", 1) is None
+
+
+STOPS = """
+import sys, time, zenoh
+from buddyline.protocol.zenoh_bus.session import config_of
+from buddyline.protocol.zenoh_bus.settings import client_settings
+with zenoh.open(config_of(client_settings(sys.argv[1], None))) as session:
+    ring = zenoh.handlers.RingChannel(1)
+    subscriber = session.declare_subscriber("buddyline/node/*/image", ring)
+    print("subscribed", flush=True)
+    time.sleep(1000)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="connections are found in /proc")
+def test_clients_that_no_longer_read_do_not_hold_up_the_others() -> None:
+    """More waits for each than its end takes. After the lease the hub closes their connections."""
+    endpoint, inbox = free_endpoint(), Inbox()
+    with hub_process(endpoint), run_client(endpoint) as node, run_client(endpoint) as receiver:
+        receiver.subscribe("buddyline/node/*/candidates", inbox)
+        publisher = node.publisher(topics.CANDIDATES, "a")
+        silent = [
+            subprocess.Popen([sys.executable, "-c", STOPS, endpoint], stdout=subprocess.PIPE, text=True)
+            for _ in range(4)
+        ]
+        try:
+            for client in silent:
+                assert client.stdout is not None
+                assert client.stdout.readline() == "subscribed\n"
+                client.send_signal(signal.SIGSTOP)
+            with zenoh.open(config_of(client_settings(endpoint, None))) as other:
+                for _ in range(20):
+                    other.put("buddyline/node/c/image", bytes(4 * 1024 * 1024))
+                    time.sleep(0.05)
+                sent: list[float] = []
+                for number in range(100):
+                    sent.append(time.monotonic())
+                    publisher.put_bytes(b"%d" % number)
+                    inbox.wait_until(lambda due=number + 1: len(inbox.payloads(publisher.key)) == due)  # type: ignore[misc]
+                    time.sleep(0.1)
+        finally:
+            for client in silent:
+                client.kill()
+                client.communicate()
+    took_s = max(b - a for a, b in itertools.pairwise(sent))
+    assert took_s < 5.0
