@@ -59,9 +59,10 @@ T = TypeVar("T")
 
 
 class _Queue(Generic[T]):
-    """Items with their sizes in bytes."""
+    """Items with their sizes in bytes. is_last: all others come before it."""
 
     def __init__(self) -> None:
+        self.is_last = False
         self.items: deque[tuple[T, int]] = deque()
         self.bytes = 0
 
@@ -71,8 +72,8 @@ class Delivery(Generic[T]):
 
     Queues take turns: a sender of more than can be handled delays and loses what is in its own queue. Items of a queue
     come in order, and so do those of an owner: while its last item may wait in another queue, the next waits there too.
-    The queue "" comes before all others. Of a queue that is full (`capacity` items) the oldest item is dropped; of all
-    together beyond MAX_QUEUED_BYTES, that of the largest. `dropped` counts them.
+    The queue "" comes before all others, and one that is last after them. Of a queue that is full (`capacity` items)
+    the oldest item is dropped; of all together beyond MAX_QUEUED_BYTES, that of the largest. `dropped` counts them.
     """
 
     def __init__(self, name: str, handle: Callable[[T], None], capacity: int, failures: FailureLatch) -> None:
@@ -92,8 +93,8 @@ class Delivery(Generic[T]):
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
-    def offer(self, item: T, size_bytes: int = 0, queue: str = "", owner: str = "") -> None:
-        """Queue an item; never waits. owner: "" for none."""
+    def offer(self, item: T, size_bytes: int = 0, queue: str = "", owner: str = "", *, is_last: bool = False) -> None:
+        """Queue an item; never waits. owner: "" for none. is_last: from now on all other queues come before this."""
         with self._changed:
             if self._closing:
                 return
@@ -102,6 +103,7 @@ class Delivery(Generic[T]):
             into = self._queues.setdefault(queue, _Queue())
             into.items.append((item, size_bytes))
             into.bytes += size_bytes
+            into.is_last = is_last
             self._bytes += size_bytes
             if len(into.items) > self._capacity:
                 self._take(queue)
@@ -146,7 +148,8 @@ class Delivery(Generic[T]):
 
     def _next(self) -> T:
         """Take an item of the queue whose turn it is."""
-        name = "" if "" in self._queues else next(iter(self._queues))
+        in_turn = (name for name, queue in self._queues.items() if not queue.is_last)
+        name = "" if "" in self._queues else next(in_turn, None) or next(iter(self._queues))
         item = self._take(name)
         if name in self._queues:
             self._queues.move_to_end(name)

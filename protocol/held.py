@@ -54,17 +54,29 @@ class Held:
                 self._bytes -= len(self._messages.popleft().payload)
                 self._added_s.popleft()
 
+    def count(self, first: int, last: int, now_s: float = 0.0) -> int:
+        """Return how many messages `find` returns now."""
+        with self._lock:
+            _, begin, end = self._places(first, last, now_s)
+            return max(end - begin, 0)
+
     def find(self, first: int, last: int, now_s: float = 0.0) -> tuple[int, list[HeldMessage]]:
         """Return the number of the oldest message that there is, and those from `first` to `last`.
 
         Who asks from 0 on knows nothing of this publisher.
         """
         with self._lock:
-            oldest = self._messages[0].number if self._messages else 0
-            if first == 0:
-                passed = bisect.bisect_left(self._added_s, now_s - self._history_s)
-                return oldest + passed, list(islice(self._messages, passed, max(last + 1 - oldest, passed)))
-            return oldest, list(islice(self._messages, max(first - oldest, 0), max(last + 1 - oldest, 0)))
+            oldest, begin, end = self._places(first, last, now_s)
+            return oldest, list(islice(self._messages, begin, max(end, begin)))
+
+    def _places(self, first: int, last: int, now_s: float) -> tuple[int, int, int]:
+        """Return the number of the oldest message that there is for who asks so, and the answer's begin and end."""
+        oldest = self._messages[0].number if self._messages else 0
+        end = min(max(last + 1 - oldest, 0), len(self._messages))
+        if first == 0:
+            passed = bisect.bisect_left(self._added_s, now_s - self._history_s)
+            return oldest + passed, passed, end
+        return oldest, max(first - oldest, 0), end
 
 
 def asked(text: str) -> tuple[int, int]:

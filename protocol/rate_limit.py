@@ -6,6 +6,7 @@ processor from all others on the machine. A stored dive is played faster than it
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import OrderedDict
@@ -18,9 +19,13 @@ from buddyline.protocol.topics import Topic, parse_key
 
 # Over the topic's nominal rate: drivers and configurations may be faster.
 MARGIN: Final = 4.0
-# What a link held up for a minute, or a program that plays a dive quickly, comes at once; of bytes less, for memory.
+# What a link held up comes at once: at its topic's rate, what its publisher holds. A client that begins to flood is
+# named and shut out only when it has used this up. Of bytes less, for memory.
 BURST_S: Final = 60.0
 BYTES_BURST_S: Final = 10.0
+# An owner that has used this share of it comes after all others, for as long as that, s, is so.
+AHEAD: Final = 1 / 6
+AHEAD_S: Final = 1.0
 # Sixteen times what 30 frames a second take; of larger messages, one a second.
 MOST_BYTES_PER_S: Final = 1_000_000.0
 # Keys that are no topic's.
@@ -29,8 +34,8 @@ OTHER_HZ: Final = 100.0
 MAX_KEYS: Final = 128
 MAX_OWNERS: Final = 256
 # So much left out between two looks is a flood; so many other owners are heard while one is shut out.
-FLOOD_MESSAGES: Final = 500
-FLOOD_BYTES: Final = 500_000
+FLOOD_MESSAGES: Final = 200
+FLOOD_BYTES: Final = 200_000
 MAX_HEARD: Final = 32
 # How long an owner is named after its last message that was left out, and how many owners are named at most.
 SAID_S: Final = 15.0
@@ -42,6 +47,11 @@ def most_hz(topic: Topic | None) -> float:
     return OTHER_HZ if topic is None else MARGIN * max(topic.rate_hz, MAX_TRIGGER_HZ)
 
 
+def most_at_once(topic: Topic | None) -> float:
+    """Return how many messages of a key of this topic are taken at once."""
+    return BURST_S * most_hz(topic) / MARGIN
+
+
 def most_bytes_per_s(topic: Topic | None) -> float:
     """Return how many bytes a second are taken of a key of this topic."""
     return max(MOST_BYTES_PER_S, 0.0 if topic is None else topic.max_bytes)
@@ -50,16 +60,22 @@ def most_bytes_per_s(topic: Topic | None) -> float:
 class _Bucket:
     """What may still come of one key now."""
 
-    __slots__ = ("bytes", "bytes_per_s", "hz", "messages", "since_s")
+    __slots__ = ("at_once", "bytes", "bytes_per_s", "hz", "messages", "since_s")
 
     def __init__(self, topic: Topic | None, now_s: float) -> None:
-        self.hz, self.bytes_per_s = most_hz(topic), most_bytes_per_s(topic)
-        self.messages, self.bytes, self.since_s = self.hz * BURST_S, self.bytes_per_s * BYTES_BURST_S, now_s
+        self.hz, self.at_once, self.bytes_per_s = most_hz(topic), most_at_once(topic), most_bytes_per_s(topic)
+        self.messages, self.bytes, self.since_s = self.at_once, self.bytes_per_s * BYTES_BURST_S, now_s
+
+    @property
+    def is_ahead(self) -> bool:
+        """Whether much has come at once."""
+        left = min(self.messages / self.at_once, self.bytes / (self.bytes_per_s * BYTES_BURST_S))
+        return left < 1.0 - AHEAD
 
     def takes(self, size_bytes: int, now_s: float) -> bool:
         """Return whether there is room for a message; if so, take it."""
         passed_s, self.since_s = now_s - self.since_s, now_s
-        self.messages = min(self.messages + passed_s * self.hz, BURST_S * self.hz)
+        self.messages = min(self.messages + passed_s * self.hz, self.at_once)
         self.bytes = min(self.bytes + passed_s * self.bytes_per_s, BYTES_BURST_S * self.bytes_per_s)
         if self.messages < 1.0 or self.bytes < size_bytes:
             return False
@@ -76,6 +92,7 @@ class _Owner:
         self.dropped = 0
         self.dropped_bytes = 0
         self.dropped_s = 0.0
+        self.ahead_s = -math.inf
         self.at_look = 0, 0
 
     def is_flood(self) -> bool:
@@ -114,12 +131,21 @@ class RateLimit:
             else:
                 self._owners.move_to_end(name)
             bucket = owner.buckets.get(key) or self._add(owner, key, now_s)
-            if bucket.takes(size_bytes, now_s):
+            takes = bucket.takes(size_bytes, now_s)
+            if bucket.is_ahead:
+                owner.ahead_s = now_s
+            if takes:
                 return True
             owner.dropped += 1
             owner.dropped_bytes += size_bytes
             owner.dropped_s = now_s
             return False
+
+    def is_ahead(self, key: str) -> bool:
+        """Return whether much has come at once from this key's owner, now or a moment ago."""
+        with self._lock:
+            owner = self._owners.get(owner_of(key))
+            return owner is not None and self._now_s() - owner.ahead_s < AHEAD_S
 
     def flooding(self) -> set[str]:
         """Return the owners of whom much was left out since the last call."""

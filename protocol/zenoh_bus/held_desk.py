@@ -45,7 +45,8 @@ class _Shelf(NamedTuple):
 class _AskedFor:
     """A question that waits. Its answer is of `count` messages, the newest first.
 
-    sent_from: the number of the last that has been sent.
+    sent_from: the number of the last that has been sent. The answer is made when its turn comes: of many questions at
+    once most get none.
     """
 
     query: zenoh.Query
@@ -53,15 +54,21 @@ class _AskedFor:
     since_s: float
     count: int = field(init=False)
     sent_from: int = field(init=False)
-    page: tuple[bytes, int] | None = field(init=False)
-    _pages: Iterator[tuple[bytes, int]] = field(init=False)
+    page: tuple[bytes, int] | None = field(init=False, default=None)
+    _pages: Iterator[tuple[bytes, int]] | None = field(init=False, default=None)
+    _numbers: tuple[int, int] = field(init=False)
 
     def __post_init__(self) -> None:
-        oldest, messages = self.shelf.held.find(*asked(str(self.query.parameters)), self.since_s)
-        self.count = len(messages)
-        self.sent_from = messages[-1].number + 1 if messages else oldest
-        self._pages = pages(oldest, reversed(messages))
-        self.page = next(self._pages)
+        self._numbers = asked(str(self.query.parameters))
+        self.count = self.shelf.held.count(*self._numbers, self.since_s)
+
+    def begin(self) -> None:
+        """Make the answer, if it is not made."""
+        if self._pages is None:
+            oldest, messages = self.shelf.held.find(*self._numbers, self.since_s)
+            self.sent_from = messages[-1].number + 1 if messages else oldest
+            self._pages = pages(oldest, reversed(messages))
+            self.page = next(self._pages)
 
     def reply(self, page: bytes) -> None:
         """Send a page."""
@@ -69,13 +76,15 @@ class _AskedFor:
 
     def send(self) -> None:
         """Send the next page."""
-        if self.page is not None:
+        if self.page is not None and self._pages is not None:
             page, self.sent_from = self.page
             self.reply(page)
             self.page = next(self._pages, None)
 
     def end(self, *, is_all: bool = False) -> None:
         """Send no more. is_all: what has been sent is all that there is for the asker."""
+        if is_all:
+            self.begin()
         if is_all and self.page is not None:
             self.reply(next(pages(self.sent_from, []))[0])
         self.query.drop()  # type: ignore[no-untyped-call]
@@ -170,6 +179,7 @@ class HeldDesk:
             if not self._waiting:
                 return True
             question = self._waiting[0]
+            question.begin()
             if question.page is None:
                 question.end()
                 del self._waiting[0]

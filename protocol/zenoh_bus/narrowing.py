@@ -13,12 +13,12 @@ from buddyline.protocol.rate_limit import MAX_HEARD, RateLimit
 from buddyline.protocol.sequence import OWNER_CHUNKS
 from buddyline.protocol.zenoh_bus.intake import Intake
 
-LOOK_S: Final = 0.25
+LOOK_S: Final = 0.1
 # So long a client is not heard; a node that has just come is, once it is seen.
 SHUT_OUT_S: Final = 10.0
 NEWCOMERS_S: Final = 1.0
 # Without a flood for so many looks the thread ends.
-IDLE_LOOKS: Final = 20
+IDLE_LOOKS: Final = 50
 
 Accept = Callable[[zenoh.Sample], bool]
 

@@ -269,7 +269,8 @@ class ZenohSubscription:
             return
         received = Received(key=key, payload=payload, receive_ns=self._clock.now_ns(), encoding=arrived.encoding)
         queue = queue_of(received.key, received.payload, received.receive_ns) if self._joined else ""
-        self._delivery.offer(received, len(received.payload), queue, arrived.source.owner)
+        is_last = self._limit.is_ahead(key)
+        self._delivery.offer(received, len(received.payload), queue, arrived.source.owner, is_last=is_last)
 
 
 def _arrived(sample: zenoh.Sample) -> Arrived:

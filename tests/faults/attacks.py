@@ -140,6 +140,12 @@ def none(_session: zenoh.Session) -> Iterator[None]:
         yield
 
 
+def burn(_session: zenoh.Session) -> Iterator[None]:
+    """Take a core of this machine, and send nothing."""
+    while True:
+        yield
+
+
 ATTACKS: dict[str, Callable[[zenoh.Session], Iterator[None]]] = {
     one.__name__: one
     for one in (small, large, images, samples, frames, gaps, queries, lasts, logs, subscribers, tokens)
@@ -148,7 +154,7 @@ ATTACKS: dict[str, Callable[[zenoh.Session], Iterator[None]]] = {
 
 def main() -> None:
     """Attack until killed."""
-    attack = {**ATTACKS, "none": none}[sys.argv[1]]
+    attack = {**ATTACKS, "none": none, "burn": burn}[sys.argv[1]]
     with zenoh.open(config_of(client_settings(sys.argv[2], None))) as session:
         for _ in attack(session):
             pass

@@ -1,6 +1,8 @@
 """One client sends as fast as it can: what that does to the poses and the memory of the others.
 
-By turns, a time without and a time with the attack. python -m tests.faults.blast --seconds 10 --turns 3
+By turns, a time without and a time with the attack, and between them one with a process that takes as much of this
+machine's processors and sends nothing: what that costs is no attack over a network.
+python -m tests.faults.blast --seconds 10 --turns 3; on a busy machine, as root: nice -n -18 ... --nice 8.
 """
 
 from __future__ import annotations
@@ -19,13 +21,15 @@ import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.tools.measure.tables import markdown_head, markdown_row
 
-from tests.faults.attacks import ATTACKS
+from tests.faults.attacks import ATTACKS, burn
 from tests.faults.observer import Observer
 from tests.faults.system import System
 from tests.processes import PATIENCE_S
 
 RATE_HZ = 10.0
 VICTIMS = ("hub", "solver", "recorder", "a", "b")
+ATTACKER = "attacker"
+HOW = ("quiet", "burning", "attacked")
 SETTLE_S = 5.0
 
 
@@ -52,15 +56,18 @@ def cpu_s(pid: int) -> float:
 class Span:
     """What happened in a part of a run: outcomes, their ages at arrival, and the shares of a core that were used."""
 
-    def __init__(self, system: System, observer: Observer, seconds: float, most_mb: dict[str, float]) -> None:
-        begin_ns, used_s = time.time_ns(), {name: cpu_s(system.processes[name].pid) for name in VICTIMS}
+    def __init__(
+        self, system: System, observer: Observer, seconds: float, most_mb: dict[str, float], attacker: int | None = None
+    ) -> None:
+        pids = {name: system.processes[name].pid for name in VICTIMS} | ({ATTACKER: attacker} if attacker else {})
+        begin_ns, used_s = time.time_ns(), {name: cpu_s(pid) for name, pid in pids.items()}
         while time.time_ns() - begin_ns < seconds * S_NS:
             for name in VICTIMS:
-                most_mb[name] = max(most_mb[name], resident_mb(system.processes[name].pid))
+                most_mb[name] = max(most_mb[name], resident_mb(pids[name]))
             time.sleep(0.2)
         count, self.late_s = poses(observer, begin_ns)
         self.rate_hz = count / seconds
-        self.shares = {name: (cpu_s(system.processes[name].pid) - used_s[name]) / seconds for name in VICTIMS}
+        self.shares = {name: (cpu_s(pid) - used_s[name]) / seconds for name, pid in pids.items()}
 
 
 def main() -> int:
@@ -69,11 +76,12 @@ def main() -> int:
     parser.add_argument("attacks", nargs="*", choices=[*ATTACKS, []], help="default: all")
     parser.add_argument("--seconds", type=float, default=10.0, help="of each turn")
     parser.add_argument("--turns", type=int, default=3)
+    parser.add_argument("--nice", type=int, default=19, help="by how much the attacker's priority is lower")
     args = parser.parse_args()
     # A SIGTERM also ends the processes that were started.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    head = ("attack", "outcomes/s, quiet", "attacked", "90 % within s, quiet", "attacked")
-    print(markdown_head((*head, *(f"{name} MB" for name in VICTIMS), "CPU " + ", ".join(VICTIMS))))
+    head = ("attack", *(f"{what}, {how}" for what in ("outcomes/s", "90 % within s") for how in HOW))
+    print(markdown_head((*head, *(f"{name} MB" for name in VICTIMS), "CPU attacker, " + ", ".join(VICTIMS))))
     for attack in args.attacks or ATTACKS:
         with (
             tempfile.TemporaryDirectory() as directory,
@@ -84,23 +92,24 @@ def main() -> int:
             system.start("solver", "recorder", "a", "b")
             observer.wait_for_match(0, PATIENCE_S)
             time.sleep(SETTLE_S)
-            # The attacker's processor is not this machine's: it gets what the others leave.
-            words = ["nice", "-n", "19", sys.executable, "-m", "tests.faults.attacks", attack, system.endpoint]
             most_mb = dict.fromkeys(VICTIMS, 0.0)
-            quiet, attacked = [], []
+            spans: dict[str, list[Span]] = {how: [] for how in HOW}
             for _ in range(args.turns):
-                quiet.append(Span(system, observer, args.seconds, most_mb))
-                with subprocess.Popen(words) as attacker:
-                    try:
-                        attacked.append(Span(system, observer, args.seconds, most_mb))
-                    finally:
-                        attacker.kill()
-                time.sleep(SETTLE_S)
+                spans["quiet"].append(Span(system, observer, args.seconds, most_mb))
+                for how, what in (("burning", burn.__name__), ("attacked", attack)):
+                    # The attacker's processor is not this machine's: it gets what the others leave.
+                    words = ["nice", "-n", str(args.nice), sys.executable, "-m", "tests.faults.attacks", what]
+                    with subprocess.Popen([*words, system.endpoint]) as attacker:
+                        try:
+                            spans[how].append(Span(system, observer, args.seconds, most_mb, attacker.pid))
+                        finally:
+                            attacker.kill()
+                    time.sleep(SETTLE_S)
             cells = [attack]
-            cells += [f"{median([span.rate_hz for span in spans]):.1f}" for spans in (quiet, attacked)]
-            cells += [f"{median([span.late_s for span in spans]):.2f}" for spans in (quiet, attacked)]
+            cells += [f"{median([span.rate_hz for span in spans[how]]):.1f}" for how in HOW]
+            cells += [f"{median([span.late_s for span in spans[how]]):.2f}" for how in HOW]
             cells += [f"{most_mb[name]:.0f}" for name in VICTIMS]
-            shares = [median([span.shares[name] for span in attacked]) for name in VICTIMS]
+            shares = [median([span.shares[name] for span in spans["attacked"]]) for name in (ATTACKER, *VICTIMS)]
             print(markdown_row([*cells, ", ".join(f"{share:.0%}" for share in shares)]), flush=True)
     return 0
 

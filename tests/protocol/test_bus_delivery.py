@@ -60,6 +60,26 @@ def test_one_queue_delays_and_drops_only_its_own_items() -> None:
     assert [item for item in handled if item.startswith("flood")] == [f"flood {number}" for number in range(900, 1000)]
 
 
+def test_a_queue_that_is_last_comes_after_all_others() -> None:
+    begun, go_on, handled = threading.Event(), threading.Event(), []
+
+    def handle(item: str) -> None:
+        begun.set()
+        assert go_on.wait(PATIENCE_S)
+        handled.append(item)
+
+    queue = Delivery("test", handle, capacity=100, failures=FailureLatch())
+    queue.offer("first", queue="flood", is_last=True)
+    assert begun.wait(PATIENCE_S)
+    for number in range(3):
+        queue.offer(f"flood {number}", queue="flood", is_last=True)
+        queue.offer(f"a {number}", queue="a")
+        queue.offer(f"b {number}", queue="b")
+    go_on.set()
+    queue.close(PATIENCE_S)
+    assert handled == ["first", "a 0", "b 0", "a 1", "b 1", "a 2", "b 2", "flood 0", "flood 1", "flood 2"]
+
+
 def test_a_handler_that_never_ends_does_not_delay_closing(caplog: pytest.LogCaptureFixture) -> None:
     go_on, handled = threading.Event(), []
 

@@ -65,6 +65,8 @@ def test_the_newest_are_held_up_to_the_depth_and_to_a_size() -> None:
     assert (oldest, [message.number for message in found]) == (7, [7, 8, 9])
     assert [message.number for message in held.find(8, 8)[1]] == [8]
     assert held.find(20, 30) == (7, [])
+    for first, last in [(0, 2**32 - 1), (8, 8), (20, 30), (0, 6), (9, 8), (6, 9)]:
+        assert held.count(first, last) == len(held.find(first, last)[1])
     large = Held(1000)
     for number in range(100):
         large.add(HeldMessage(number, bytes(MAX_HELD_BYTES // 10), again=False))

@@ -9,8 +9,9 @@ from collections.abc import Sequence
 import pytest
 import zenoh
 from buddyline.protocol import rate_limit, topics
+from buddyline.protocol.bus import CACHE_S, cache_depth
 from buddyline.protocol.codec import payload_stamp_ns
-from buddyline.protocol.rate_limit import BURST_S, BYTES_BURST_S, MARGIN, MOST_BYTES_PER_S, RateLimit, most_hz
+from buddyline.protocol.rate_limit import BYTES_BURST_S, MARGIN, MOST_BYTES_PER_S, RateLimit, most_at_once, most_hz
 from buddyline.protocol.security import PLAYER
 from buddyline.protocol.zenoh_bus import narrowing, open_hub
 from buddyline.protocol.zenoh_bus.alive import ALIVE, MAX_TOKENS
@@ -50,17 +51,38 @@ def test_what_is_more_is_left_out_and_its_owner_named_for_a_while() -> None:
     clock = SecondsClock()
     limit = RateLimit(clock)
     key, hz = topics.IMU.key("c"), most_hz(topics.IMU)
-    assert admitted(limit, key, 100_000) == BURST_S * hz
+    assert admitted(limit, key, 100_000) == most_at_once(topics.IMU)
     clock.now_s += 1.0
     assert admitted(limit, key, 100_000) == hz
-    left_out = round(200_000 - (BURST_S + 1) * hz)
+    left_out = round(200_000 - most_at_once(topics.IMU) - hz)
     assert limit.dropped == {"buddyline/node/c": left_out}
     assert limit.problem() == f"buddyline/node/c sends too much: {left_out} messages left out"
+    # At once comes what a publisher of this rate holds for those that missed it.
+    assert most_at_once(topics.IMU) == cache_depth(topics.IMU, CACHE_S)
     # Other keys, its own too, have what is theirs.
     assert admitted(limit, topics.CANDIDATES.key("c"), 100) == 100
     assert admitted(limit, topics.IMU.key("a"), 100) == 100
     clock.now_s += rate_limit.SAID_S
     assert limit.problem() == ""
+
+
+def test_who_sends_much_at_once_is_ahead_for_a_while_and_who_keeps_its_rate_never_is() -> None:
+    clock = SecondsClock()
+    limit = RateLimit(clock)
+    a, c = topics.IMU.key("a"), topics.IMU.key("c")
+    for _ in range(100):
+        clock.now_s += 0.1
+        admitted(limit, a, round(MARGIN * topics.IMU.rate_hz / 10))
+        assert not limit.is_ahead(a)
+    admitted(limit, c, round(most_at_once(topics.IMU) * rate_limit.AHEAD) + 1)
+    assert limit.is_ahead(c)
+    assert limit.is_ahead(topics.CANDIDATES.key("c"))
+    assert not limit.is_ahead(a)
+    assert limit.dropped == {}
+    clock.now_s += rate_limit.AHEAD_S
+    assert not limit.is_ahead(c)
+    admitted(limit, topics.CANDIDATES.key("c"), 30, 65536)
+    assert limit.is_ahead(c)
 
 
 def test_bytes_count_too() -> None:
@@ -73,7 +95,7 @@ def test_keys_that_an_owner_invents_share_one_limit_and_take_nothing_from_others
     for number in range(100_000):
         limit.admits(f"buddyline/node/c/x{number}", 1)
         limit.admits(f"buddyline/pair/c/x{number}/pose", 1)
-    taken = rate_limit.OTHER_HZ * BURST_S
+    taken = most_at_once(None)
     assert limit.dropped["buddyline/node/c"] == 100_000 - taken
     assert limit.dropped["buddyline/pair/c"] == 100_000 - taken - rate_limit.MAX_KEYS
     assert admitted(limit, topics.CANDIDATES.key("a"), 100) == 100
@@ -89,7 +111,7 @@ def test_owners_that_are_invented_are_forgotten() -> None:
 def test_a_flood_is_left_out_before_it_is_queued_and_a_stored_dive_is_no_flood(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rate_limit, "BURST_S", 5.0)
     monkeypatch.setattr(narrowing, "SHUT_OUT_S", 0.5)
-    endpoint, inbox, count = free_endpoint(), Inbox(), 2 * round(5.0 * most_hz(topics.DEPTH))
+    endpoint, inbox, count = free_endpoint(), Inbox(), 2 * round(most_at_once(topics.DEPTH))
     own = topics.DEPTH.key("c")
     with open_hub(endpoint), run_client(endpoint) as receiver, run_client(endpoint) as node:
         subscription = receiver.subscribe(topics.EVERYTHING, inbox, capacity=100_000)
@@ -104,7 +126,7 @@ def test_a_flood_is_left_out_before_it_is_queued_and_a_stored_dive_is_no_flood(m
             began_s = time.monotonic()
             until(flood, 0.0)
             taken = len(inbox.payloads(own))
-            assert taken <= (rate_limit.BURST_S + time.monotonic() - began_s) * most_hz(topics.DEPTH)
+            assert taken <= most_at_once(topics.DEPTH) + (time.monotonic() - began_s) * most_hz(topics.DEPTH)
             assert "buddyline/node/c sends too much" in receiver.flood_problem()
             node.declare_alive(PLAYER)
             until(lambda: receiver._players)  # type: ignore[attr-defined]
