@@ -285,6 +285,8 @@ def main() -> int:
     parser.add_argument("--teams", type=int, default=1, help="of as many nodes each, which do not see each other")
     parser.add_argument("--seconds", type=float, default=0.0, help="before the first kill, to measure in")
     args = parser.parse_args()
+    # A SIGTERM also ends the processes that were started.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     with tempfile.TemporaryDirectory() as folder:
         found = soak(
             Path(folder),
