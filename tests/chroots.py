@@ -35,6 +35,11 @@ mount -t proc proc "$1/proc"; mount --rbind /dev "$1/dev"; mount --rbind /sys "$
 # As Raspberry Pi OS has it: a package of the system, which pip sees as one.
 CAMERA = "usr/lib/python3/dist-packages/picamera2"
 CAMERA_VERSION = "0.3.31"
+# What the node's driver imports of it, on a Pi whose camera is not plugged in.
+STAND_IN = """class MappedArray: ...
+class Picamera2:
+    global_camera_info = staticmethod(list)
+"""
 
 
 class FailedError(Exception):
@@ -161,7 +166,7 @@ def _stand_in(folder: Path) -> None:
     folder.mkdir()
     camera, lgpio = folder / "python3-picamera2", folder / "python3-lgpio"
     (camera / CAMERA).mkdir(parents=True)
-    (camera / CAMERA / "__init__.py").write_text("class Picamera2:\n    global_camera_info = staticmethod(list)\n")
+    (camera / CAMERA / "__init__.py").write_text(STAND_IN)
     about = camera / f"{CAMERA}-{CAMERA_VERSION}.dist-info" / "METADATA"
     about.parent.mkdir()
     about.write_text(f"Metadata-Version: 2.1\nName: picamera2\nVersion: {CAMERA_VERSION}\n")

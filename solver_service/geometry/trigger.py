@@ -214,7 +214,7 @@ class _Batched:
         rival = int(rivals.argmax())
         if rivals[rival] > weighed.log_ratio[k] - _RIVAL:
             why = f"another stands at {math.hypot(*t[rival].tolist()):.3g} m"
-        return NoFix("ambiguous", f"{what} is {probability:.0%} likely: {why} (chi2 {chi2:.1f})")
+        return NoFix("ambiguous", f"{what} is {_too_unlikely(probability, required)}: {why} (chi2 {chi2:.1f})")
 
     def _against_headings(
         self, trigger: int, weighed: Weighed, k: int, covariance: Floats, learned: Heading | None
@@ -289,6 +289,11 @@ def _is_doubtful(found: Fix | NoFix, weighed: Weighed | None) -> bool:
         return True
     k = int(weighed.log_ratio.argmax())
     return bool(weighed.log_prior[k] < 0.0 or weighed.log_false[k] > POOR_FIT)
+
+
+def _too_unlikely(probability: float, required: float) -> str:
+    """Say how likely a pose is, rounded down, so that what is not enough never reads as enough."""
+    return f"{math.floor(1000.0 * probability) / 10.0:g}% likely, where {100.0 * required:g}% is asked for"
 
 
 def _why_unfit(weighed: Weighed, k: int, why: str) -> tuple[Reason, str]:

@@ -1,6 +1,7 @@
 """One trigger: the right four lights, the right pose, or a reason."""
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -134,6 +135,22 @@ def test_a_stuck_depth_sensor_costs_little():
     right, wrong = choices(4, 60, sensors=True, depth_error_m=3.0)
     assert right >= 0.9
     assert wrong <= 0.02
+
+
+def test_what_is_too_unlikely_never_reads_as_likely_enough():
+    rng = np.random.default_rng(8)
+    found = set()
+    for required in (0.9, 0.98, 0.999, 0.9999, 0.999999):
+        for _ in range(8):
+            scene = random_scene(rng, (2.0, 6.0))
+            (a, _), (b, _) = scene.views(rng, 1.0, 3)
+            result = solve(scene, (a, b), settings=replace(DEFAULT, min_probability=required))
+            if isinstance(result, NoFix) and result.reason == "ambiguous":
+                likely, asked = re.search(r"is ([\d.]+)% likely, where ([\d.]+)% is asked for: ", result.detail).groups()
+                assert float(asked) == pytest.approx(100.0 * required)
+                assert float(likely) < float(asked)
+                found.add(likely)
+    assert max(map(float, found)) > 99.0
 
 
 def test_false_candidates_alone_give_no_pose():

@@ -12,7 +12,7 @@ import pytest
 from buddyline.node.choices import DETECTORS
 from buddyline.node.detect import make_detector
 from buddyline.protocol.errors import BuddylineError
-from buddyline.tools.draw import figures
+from buddyline.tools.draw import errors, figures
 from buddyline.tools.draw.marks import mark_candidates, mark_lights, marked_svg
 from buddyline.tools.draw.page import page, section, table
 
@@ -124,6 +124,17 @@ class TestPage:
 
     def test_alarms_are_marked(self) -> None:
         assert table([["a"], ["b"]], alarms=[1]).count('class="alarm"') == 1
+
+
+def test_medians_are_drawn_beside_the_bounds_median_not_its_rms():
+    bound = [{"from_m": 2.0, "to_m": 4.0, "bound_median_m": 0.01, "bound_rms_m": 0.03}]
+    rows = [{"from_m": 2.0, "to_m": 4.0, "position_median_m": 0.02, "position_rmse_m": 0.5}]
+    (axis,) = errors.medians_over_range({"ours": rows, "none": []}, bound).axes
+    drawn = {line.get_label(): (list(line.get_xdata()), list(line.get_ydata())) for line in axis.lines}
+    assert drawn["Cramér-Rao bound, median"] == ([3.0], [0.01])
+    assert drawn["ours"] == ([3.0], [0.02])
+    assert "none" not in drawn
+    assert "median" in axis.get_ylabel()
 
 
 def test_a_far_value_does_not_stretch_an_axis():
