@@ -146,7 +146,9 @@ def test_what_is_too_unlikely_never_reads_as_likely_enough():
             (a, _), (b, _) = scene.views(rng, 1.0, 3)
             result = solve(scene, (a, b), settings=replace(DEFAULT, min_probability=required))
             if isinstance(result, NoFix) and result.reason == "ambiguous":
-                likely, asked = re.search(r"is ([\d.]+)% likely, where ([\d.]+)% is asked for: ", result.detail).groups()
+                likely, asked = re.search(
+                    r"is ([\d.]+)% likely, where ([\d.]+)% is asked for: ", result.detail
+                ).groups()
                 assert float(asked) == pytest.approx(100.0 * required)
                 assert float(likely) < float(asked)
                 found.add(likely)

@@ -286,6 +286,7 @@ def run_watch(args: argparse.Namespace, seconds: float | None) -> int:
 
     def watch(bus: Bus) -> None:
         Watch(bus, client.refusals).attach()
+        log.info("survey watch: %s: each rest is judged at its tenth second; Ctrl-C ends", client.config.connect)
         client.wait()
 
     return client.run(watch)
