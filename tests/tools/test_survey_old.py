@@ -18,9 +18,10 @@ from buddyline.tools.survey.old.systems import map_system
 from buddyline.tools.survey.old.writing import svx_of, svx_system, th_of, therion_system
 from buddyline.tools.survey.project import Equate, Project, load_project
 from buddyline.tools.survey.sheet import Sheet
+from msgspec import UNSET
 from msgspec.structs import replace
 
-from tests.processes import PATIENCE_S
+from tests.processes import PATIENCE_S, REPOSITORY
 from tests.tools import survey_world as world
 from tests.tools.old_cave import CAVE, DAT, TH, read
 
@@ -237,6 +238,51 @@ def test_new_legs_hang_on_an_old_survey_in_one_adjustment(tmp_path, first):
     text = survex.th(sheet)
     assert "survey cave" in text
     assert ("equate 4@demo 3@stream.cave" in text) == (first == "new")
+
+
+def without_bearings(leg):
+    return replace(leg, azimuth_deg=UNSET, back_azimuth_deg=UNSET, inclination_deg=UNSET, back_inclination_deg=UNSET)
+
+
+@CAVERN
+@THERION
+@pytest.mark.parametrize("what", ["tapes", "nodes", "both"])
+def test_stations_by_distances_alone_stand_in_cave_programs_where_they_are_adjusted(tmp_path, what):
+    course = world.line(np.random.default_rng(6), 4)
+    # The last station is seen from the first three by distances alone.
+    course.legs = [(0, 1, 0), (1, 2, 1), (2, 3, 0), (0, 4, 0), (1, 4, 0), (2, 4, 0)]
+    rows = world.readings_of(course, np.random.default_rng(2), tape_m=0.005)
+    project, tapes = world.project_of([*rows[:3], *map(without_bearings, rows[3:])]), []
+    if what == "tapes":
+        project = load_project(REPOSITORY / "examples" / "datums" / "site.toml")
+        tapes = [named(read_old(REPOSITORY / "examples" / "datums" / "tapes.csv"), "site")]
+    elif what == "both":
+        # D5 hangs on one distance alone, and cannot be placed.
+        ways = [(f"D{leg.from_}", "D4", leg) for leg in rows[3:]] + [("D4", "D5", rows[3])]
+        table = [f"{i},{j},{leg.distance_m},0.005,{leg.depth_from_m},{leg.depth_to_m},0.02" for i, j, leg in ways]
+        (tmp_path / "tapes.csv").write_text(
+            "\n".join(["from,to,distance_m,sigma_m,depth_from_m,depth_to_m,depth_sigma_m", *table])
+        )
+        tapes = [named(read_old(tmp_path / "tapes.csv"), "site")]
+        equates = [Equate(stations=[str(k), f"site.D{k}"]) for k in range(3)]
+        project = replace(world.project_of(rows[:3]), equate=equates)
+    project = joined(project, tapes)
+    sheet = Sheet(project, adjust(project), tapes)
+    text = survex.th(sheet)
+    (tmp_path / "own.th").write_text(text)
+    for found in (
+        by_cavern(tmp_path, survex.svx(sheet), "own"),
+        by_cavern(tmp_path, survex.svx_cartesian(sheet), "vectors"),
+        by_therion(tmp_path, "own.th", "own_th"),
+    ):
+        assert len(sheet.adjusted.positions) == (6 if what == "tapes" else 5)
+        shift = None
+        for name, position in sheet.adjusted.positions.items():
+            at = found[(name if "." in name else f"{sheet.name}.{name}").lower()]
+            # Without a fixed point and a part that hangs on nothing, each program begins where it likes.
+            shift = position.position_m - at if shift is None else shift
+            # What distances move legs that have bearings by, these programs cannot know.
+            assert np.abs(at + shift - position.position_m).max() <= (SAME_M if what == "tapes" else 0.02), name
 
 
 @CAVERN

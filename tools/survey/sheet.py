@@ -15,7 +15,7 @@ from buddyline.tools.survey.lines import Line, bearing_of
 from buddyline.tools.survey.marks import section_of
 from buddyline.tools.survey.network import Adjusted
 from buddyline.tools.survey.old.joining import same_place
-from buddyline.tools.survey.old.model import CrossSection, OldSurvey
+from buddyline.tools.survey.old.model import CrossSection, OldShot, OldSurvey, merged
 from buddyline.tools.survey.project import Leg, Project
 from msgspec import UNSET, structs
 
@@ -70,7 +70,14 @@ class Sheet:
     """An adjusted survey, ready to be written down."""
 
     def __init__(self, project: Project, adjusted: Adjusted, olds: Sequence[OldSurvey] = ()) -> None:
-        self.project, self.adjusted, self.olds = project, adjusted, olds
+        self.project, self.adjusted = project, adjusted
+        same_as = same_place(project, olds)
+
+        def placed(shot: OldShot) -> bool:
+            return shot.style != "distance" or {same_as(shot.start), same_as(shot.end)} <= set(adjusted.positions)
+
+        # Distances that are too few to place a station: no cave program takes it.
+        self.olds = [replace(old, shots=list(filter(placed, old.shots))) for old in olds]
         about = project.survey
         theirs = {station.partition(".")[0] for old in olds for station in old.stations}
         # A survey of the hierarchy has one name.
@@ -146,11 +153,32 @@ class Sheet:
     def own_fixed(self) -> Fixed:
         """Fixed stations that no old survey has fixed, those of this survey's legs; by the names they have here."""
         if not self.olds:
-            return self.fixed
+            return self.fixed | self.held
         same_as = same_place(self.project, self.olds)
         theirs = {same_as(fix.station) for old in self.olds for fix in old.fixes}
-        ours = {name for reading in self.readings for name in (reading.leg.from_, reading.leg.to)}
-        return {self.local(name): at for name, at in self.fixed.items() if name in ours - theirs}
+        return {self.local(name): at for name, at in self.fixed.items() if name in self._own_stations - theirs}
+
+    @cached_property
+    def held(self) -> Fixed:
+        """Stations that other programs, which place nothing by distances, must be told: as fixed, or as adjusted.
+
+        Of each part that bearings join, if nothing else in the file fixes it: what the project fixes there, or the
+        first station where there are several parts.
+        """
+        same_as, positions = same_place(self.project, self.olds), self.adjusted.positions
+        part_of = merged((line.leg.from_, line.leg.to) for line in self.adjusted.lines)
+        parts: dict[str, list[str]] = {}
+        for name in positions:
+            parts.setdefault(part_of(name), []).append(name)
+        written = {same_as(fix.station) for old in self.olds for fix in old.fixes}
+        written |= set(self.fixed) if not self.olds else set(self.fixed) & self._own_stations
+        found: Fixed = {}
+        for names in parts.values():
+            if written.isdisjoint(names):
+                stated = [name for name in names if self.project.fix and name in self.fixed]
+                for name in stated or (names[:1] if len(parts) > 1 else []):
+                    found[name] = self.fixed.get(name) or (positions[name].position_m, positions[name].sigmas_m)
+        return found
 
     @staticmethod
     def local(name: str) -> str:
@@ -165,7 +193,7 @@ class Sheet:
     @property
     def joints(self) -> list[list[str]]:
         """Names of one place in this survey and in old ones, the latter with points."""
-        ours = {name for reading in self.readings for name in (reading.leg.from_, reading.leg.to)}
+        ours = self._own_stations
         of_old = {name for old in self.olds for name in old.stations}
         stated = [[name for name in one.stations if name in ours | of_old] for one in self.project.equate]
         shared = [[name, self.local(name)] for name in sorted(ours) if "." in name and name in of_old]
@@ -185,6 +213,17 @@ class Sheet:
             if end is not None:
                 found[-1].append(end)
         return found
+
+    @cached_property
+    def undirected(self) -> list[Leg]:
+        """The nodes' legs that took part and make no vector: they have no bearing, or no rise."""
+        directed = {id(line.leg) for line in self.adjusted.lines}
+        return [leg for leg, _ in self.adjusted.survey.stations_legs if leg.from_node and id(leg) not in directed]
+
+    @cached_property
+    def _own_stations(self) -> set[str]:
+        own = [*(reading.leg for reading in self.readings), *self.undirected]
+        return {name for leg in own for name in (leg.from_, leg.to)}
 
     @property
     def entrances(self) -> list[str]:

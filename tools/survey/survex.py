@@ -8,18 +8,21 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from buddyline.tools.survey.averages import Floats
+from buddyline.tools.survey.old.systems import map_system
 from buddyline.tools.survey.old.writing import (
     SVX,
     TH,
     InForce,
     Written,
     quoted,
+    survex_system,
     svx_of,
     svx_system,
     th_of,
     therion_person,
+    therion_system,
 )
-from buddyline.tools.survey.sheet import Reading, Sheet
+from buddyline.tools.survey.sheet import Reading, Sheet, remark_on
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,21 @@ class Language:
         back = {"backcompass": compass} if self.back_sd else {}
         return {self.tape: f"{tape_m:.4f} metres", "compass": compass} | back | rise
 
+    def unplaced(self, sheet: Sheet) -> Iterator[str]:
+        """Yield the legs that make no vector: as lines between stations, with the distance in the remark."""
+        if sheet.undirected:
+            yield f"{self.command}data nosurvey from to"
+        for leg in sheet.undirected:
+            ends = [sheet.local(leg.from_), sheet.local(leg.to)]
+            yield self.gap.join([*ends, f"{self.comment} {leg.distance_m:.4f} m {remark_on(leg)}"])
+
+    def fix(self, name: str, position_m: Floats, sigmas_m: Floats) -> str:
+        """Return the line of a fixed station."""
+        # Without correlations Survex takes standard deviations of both axes on the map, and of height.
+        shown = [sigmas_m[0], sigmas_m[2]] if self is SURVEX else sigmas_m
+        sds = [f"{max(one, 0.001):.3f}" for one in shown] if sigmas_m.any() else []
+        return " ".join([f"{self.command}fix {name}", *(f"{one:.4f}" for one in position_m), *sds])
+
     @staticmethod
     def _angle(angle_deg: float | None) -> str:
         return "-" if angle_deg is None else f"{angle_deg % 360:07.3f}".replace("360.000", "000.000")
@@ -144,10 +162,6 @@ def _reread(reading: Reading, how: str, distance_m: float, fore: float | None, b
     )
 
 
-def _therion_sd(sigmas_m: Floats) -> str:
-    return f" {sigmas_m[0]:.3f} {sigmas_m[1]:.3f} {sigmas_m[2]:.3f}" if sigmas_m.any() else ""
-
-
 def svx(sheet: Sheet, style: str = "auto") -> str:
     """Return .svx text: tape, compass, backcompass and depths or clino, each leg with its own sds.
 
@@ -169,6 +183,7 @@ def svx(sheet: Sheet, style: str = "auto") -> str:
         "*units compass backcompass clino degrees",
         "*sd position 0.001 metres ; how well a node is held is in each leg's own",
         *SURVEX.data(sheet, map(sheet.renamed, sheet.readings), by_clino),
+        *SURVEX.unplaced(sheet),
         *(row for sections in sheet.passages for row in SVX.sections(sections, sheet.local)),
     ]
     return _svx_file(sheet, body)
@@ -187,7 +202,7 @@ def svx_cartesian(sheet: Sheet) -> str:
         values = "\t".join(f"{value:.4f}" for value in line.vector_m)
         ends = "\t".join(map(sheet.local, (line.leg.from_, line.leg.to)))
         body.append(f"{ends}\t{values}\t; n={line.leg.fixes} grade {line.leg.grade}")
-    return _svx_file(sheet, body)
+    return _svx_file(sheet, [*body, *SURVEX.unplaced(sheet)])
 
 
 def _svx_file(sheet: Sheet, body: list[str]) -> str:
@@ -196,6 +211,7 @@ def _svx_file(sheet: Sheet, body: list[str]) -> str:
         f"; {sheet.title}",
         f"; {sheet.why}",
         "; Buddyline; from is never swapped with to; sds are 1 sd",
+        "*case preserve",
         *([f"*cs {grid}", f"*cs out {grid}"] if grid else []),
         f"*begin {sheet.name}",
         # Where one survey states its exports, Survex expects them of all.
@@ -206,13 +222,11 @@ def _svx_file(sheet: Sheet, body: list[str]) -> str:
         *(f"*instrument {kind} {quoted(text)}" for kind, text in sheet.instruments.items()),
         *(f"; {note}" for note in sheet.notes),
     ]
-    for name, (position, sigma_m) in fixed.items():
-        # Without correlations Survex takes standard deviations of both axes on the map, and of height.
-        sd = f" {max(sigma_m[0], 0.001):.3f} {max(sigma_m[2], 0.001):.3f}" if sigma_m.any() else ""
-        lines.append(f"*fix {name} reference {position[0]:.4f} {position[1]:.4f} {position[2]:.4f}{sd}")
+    lines += [SURVEX.fix(name, *at) for name, at in fixed.items()]
     lines += [f"*entrance {name}" for name in sorted(sheet.entrances) if name in fixed]
+    own_legs = sheet.readings or sheet.undirected
     lines += [f"; left out: {leg.name} {leg.distance_m:.2f} m, {why}" for leg, why in sheet.adjusted.left_out]
-    if sheet.olds and not sheet.readings:
+    if sheet.olds and not own_legs:
         return "\n".join([*lines[: lines.index(f"*begin {sheet.name}")], *_svx_olds(sheet, grid), ""])
     return "\n".join([*lines, *body, f"*end {sheet.name}", *_svx_olds(sheet, grid), ""])
 
@@ -224,14 +238,23 @@ def _svx_olds(sheet: Sheet, grid: str) -> Iterator[str]:
         if not grid and not number:
             yield from svx_system(sheet.olds[0])
         yield from ["*begin", *written.lines, "*end"]
-    yield from _joints(sheet, olds, "*equate", lambda name: f"{sheet.name}.{sheet.local(name)}")
+    joints, fixes = _joints(sheet, olds, SURVEX, lambda name: f"{sheet.name}.{sheet.local(name)}")
+    system = map_system(sheet.olds[0]) if olds and not grid else ""
+    yield from [*joints, *[f"*cs {survex_system(system)}"] * bool(fixes and system), *fixes]
 
 
-def _joints(sheet: Sheet, olds: list[Written], equate: str, own: Callable[[str], str]) -> Iterator[str]:
-    """Yield what joins old surveys to this one. own: the name that the file has for a station of this one."""
+def _joints(sheet: Sheet, olds: list[Written], to: Language, own: Callable[[str], str]) -> tuple[list[str], list[str]]:
+    """Return what joins old surveys to this one, and stations that must be told where they are.
+
+    own: the name that the file has for a station of this one.
+    """
     name_of = {name: one.name(name) for old, one in zip(sheet.olds, olds, strict=True) for name in old.stations}
-    for same in sheet.joints:
-        yield f"{equate} {' '.join(name_of.get(name) or own(name) for name in same)}"
+
+    def named(name: str) -> str:
+        return name_of.get(name) or own(name)
+
+    fixes = [to.fix(named(name), *at) for name, at in sheet.held.items()] if sheet.olds else []
+    return [f"{to.command}equate {' '.join(map(named, same))}" for same in sheet.joints], fixes
 
 
 def th(sheet: Sheet, style: str = "auto") -> str:
@@ -255,21 +278,28 @@ def th(sheet: Sheet, style: str = "auto") -> str:
         ),
         *(f"# {note}" for note in sheet.notes),
         *([f"cs {grid}"] if grid else []),
-        *(f"fix {name} {p[0]:.4f} {p[1]:.4f} {p[2]:.4f}{_therion_sd(sd)}" for name, (p, sd) in sheet.own_fixed.items()),
+        *(THERION.fix(name, *at) for name, at in sheet.own_fixed.items()),
         *(f'station {name} "" entrance' for name in sheet.entrances if name in sheet.own_fixed),
         "units length depth metres",
         "units compass clino degrees",
         "calibrate depth 0 -1",
         *THERION.data(sheet, readings, lambda reading: reading.by_clino),
+        *THERION.unplaced(sheet),
         *(row for sections in sheet.passages for row in TH.sections(sections, sheet.local)),
     ]
     head = ["encoding utf-8", f"# {sheet.why}", f"survey {sheet.name} -title {quoted(sheet.title)}", "  centreline"]
     body = [*head, *(f"    {row}" for row in rows), "  endcentreline", "endsurvey"]
-    return "\n".join([*(body if readings or not sheet.olds else head[:2]), *_th_olds(sheet, grid), ""])
+    return "\n".join(
+        [*(body if readings or sheet.undirected or not sheet.olds else head[:2]), *_th_olds(sheet, grid), ""]
+    )
 
 
 def _th_olds(sheet: Sheet, grid: str) -> Iterator[str]:
     olds = [th_of(old, grid) for old in sheet.olds]
     for written in olds:
         yield from written.lines
-    yield from _joints(sheet, olds, "equate", lambda name: f"{sheet.local(name)}@{sheet.name}")
+    joints, fixes = _joints(sheet, olds, THERION, lambda name: f"{sheet.local(name)}@{sheet.name}")
+    yield from joints
+    system = therion_system(map_system(sheet.olds[0])) if olds and not grid else grid
+    if fixes:
+        yield from ["centreline", *[f"  cs {system}"] * bool(system), *(f"  {one}" for one in fixes), "endcentreline"]
