@@ -30,6 +30,9 @@ IRON_SHARE: Final = 0.4
 # Time in which a gauge's zero may change by its slow error (MS5837-30BA data sheet: long-term stability; measured
 # zeros of a rig that warms up change within the first hour).
 DRIFT_S: Final = 3600.0
+# Time in which the zero of a gyroscope forgets by how much it was off its mean (Allan deviations of MEMS gyroscopes
+# are flat from one to ten minutes).
+WANDER_S: Final = 300.0
 # The water level of another dive, 1 sd: tide, flood, or the air pressure at which the zero was taken.
 LEVEL_M: Final = 0.5
 # 1 sd of a tide's rate.
@@ -38,6 +41,9 @@ TIDE_M_PER_S: Final = 0.5 / 3600.0
 WATER_M: Final = 1e4
 NORTH: Final = "north"
 WATER: Final = "water level"
+# What the names of unknowns begin with that are no instruments': a leg's azimuth, and a gyroscope's wander in one turn.
+SIGHT: Final = "sight"
+WANDER: Final = "wander"
 
 # Position (3,) and its standard deviations (3,): east, north, up, m.
 Fixed: TypeAlias = dict[str, tuple[Floats, Floats]]
@@ -342,7 +348,7 @@ class _Compasses:
         """Add the unknown azimuth of a leg's line from camera to camera; return its column."""
         leg = to.legs[number]
         guess = _guess(leg, to.turns_rad[number])
-        column = self._of.unknown(f"sight {number}", None, guess)
+        column = self._of.unknown(f"{SIGHT} {number}", None, guess)
         run_m = max(leg.distance_m, 0.3)
         held = math.sqrt(2) * max(self._project.settings.centering_m, 1e-3) / run_m
         self._of.add("azimuth", start, end, 0.0, held, [(column, -1.0)], leg=number, what="centering")
@@ -388,20 +394,31 @@ def _guess(leg: Leg, turn_rad: float) -> float:
 
 def _add_turns(to: Assembly, project: Project, sighted: _Compasses) -> None:
     of, settings = to.observations, project.settings
+    # By gyroscope: begin of its last turn, that turn's length, and the column of the angle that its wander made of it.
+    last: dict[str, tuple[int, float, int]] = {}
     for one in project.turn:
         ends = [sighted.sights.get((one.dive, ns, one.node)) for ns in (one.from_ns, one.to_ns)]
         if ends[0] is None or ends[1] is None:
             continue
         (column_0, facing_0), (column_1, facing_1) = ends[0], ends[1]
         angle, name = math.radians(one.angle_deg), f"gyroscope of {one.node} in dive {one.dive}"
+        what = f"gyroscope of {one.node}"
+        # A zero that wanders adds up over many turns as one that is new in each of them does not.
+        wander = of.unknown(f"{WANDER} {one.from_ns} {name}")
+        before_ns, before_s, before = last.get(name, (one.from_ns, one.seconds, wander))
+        kept = 0.0 if before == wander else math.exp(-abs(one.from_ns - before_ns) / S_NS / WANDER_S)
+        sigma = math.radians(settings.gyro_wander_dps) * one.seconds * math.sqrt(1 - kept**2)
+        of.add("angle", -1, -1, 0.0, sigma, [(wander, 1.0), (before, -kept * one.seconds / before_s)], what=what)
+        last[name] = one.from_ns, one.seconds, wander
         terms = [
             (column_1, 1.0),
             (column_0, -1.0),
+            (wander, 1.0),
             (of.unknown(f"{name}: zero", math.radians(settings.gyro_zero_dps)), one.seconds),
             (of.unknown(f"{name}: scale", settings.gyro_scale), angle),
         ]
         value = wrap(angle - facing_1 + facing_0)
-        of.add("angle", -1, -1, value, math.radians(one.sigma_deg), terms, what=f"gyroscope of {one.node}")
+        of.add("angle", -1, -1, value, math.radians(one.sigma_deg), terms, what=what)
 
 
 def _add_known(to: Assembly, known: Sequence[Known]) -> None:

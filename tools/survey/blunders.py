@@ -148,9 +148,11 @@ def _suspects(survey: Survey, solution: Solution, taken: Change) -> Iterator[_Su
     tried = (r > least) & ~model.robust & ~model.told_by_robust
     every = list(_visits(survey, taken))
     critical = critical_chi2(int(tried.sum()) + len(every), known)
+    # A disturbed compass pulls at gyroscopes here, but not in the adjustment, where its weight falls.
+    disturbed = w2[model.robust].max(initial=0.0)
     for row in np.flatnonzero(tried & (w2 > critical)).tolist():
         leg, what = int(model.leg[row]), of.what[row]
-        if (leg, what) in taken.drops:
+        if (leg, what) in taken.drops or (what.startswith("gyroscope") and w2[row] < disturbed):
             continue
         off = abs(float(solution.misfit[row] / r[row]))
         if model.kind[row] == DISTANCE and leg >= 0 and survey.legs[leg].from_node:

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.errors import BuddylineError
-from buddyline.tools.survey.assembly import Fixed, assemble, depths_of
+from buddyline.tools.survey.assembly import SIGHT, Fixed, assemble, depths_of
 from buddyline.tools.survey.averages import Floats, wrap
 from buddyline.tools.survey.gauges import tides_of
 from buddyline.tools.survey.geodesy import Grid, leg_date
@@ -207,7 +207,7 @@ class Survey:
         sigma = solution.model.sigma
         distance = rows[number, "distance"]
         distance_m = leg.distance_m / (1 + float(solution.terms[distance]))
-        carried = solution.observations.has(f"sight {number}")
+        carried = solution.observations.has(f"{SIGHT} {number}")
         if carried is not None:
             run_m = max(leg.distance_m, 0.3)
             held = math.sqrt(2) * max(self.project.settings.centering_m, 1e-3) / run_m

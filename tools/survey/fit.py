@@ -8,6 +8,7 @@ from statistics import NormalDist
 from typing import Final
 
 import numpy as np
+from buddyline.tools.survey.assembly import SIGHT, WANDER
 from buddyline.tools.survey.averages import Floats
 from buddyline.tools.survey.observations import CHECKED, Solution
 
@@ -59,7 +60,7 @@ def chance_of(chi2: float, freedom: int) -> float:
 def fit_of(solution: Solution) -> SurveyFit:
     """Return the tests of an adjustment. Unknowns with a prior are observed by it as well."""
     of = solution.observations
-    names = [name for name in of.names if not name.startswith("sight ")]
+    names = [name for name in of.names if not name.startswith((SIGHT, WANDER))]
     columns = np.array([of.unknown(name) for name in names], dtype=np.int64)
     sigmas = np.sqrt(solution.variances(columns)) if names else np.empty(0)
     instruments = {}

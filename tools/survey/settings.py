@@ -22,7 +22,7 @@ class SurveySettings(Config, frozen=True, kw_only=True):
     compass_common_deg: 1 sd, an error that all azimuths share (declination, mount): it turns the survey as a whole.
     disturbed_deg: 1 sd of a compass in a disturbed field, used where there is no other compass.
     gyro_zero_dps, gyro_scale: 1 sd of a gyroscope's zero (deg/s) and of its scale, unknowns of each dive.
-    gyro_wander_dps: 1 sd, how much the zero differs from turn to turn. gyro_noise_dps_rthz: its noise density.
+    gyro_wander_dps: 1 sd, how far the zero wanders. gyro_noise_dps_rthz: its noise density.
     reference_m: node id to its station's point ([x, y, z], camera frame), where that is not the camera's centre.
     """
 

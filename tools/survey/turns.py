@@ -39,7 +39,6 @@ def turns_of(readings: PairReadings, chosen: Sequence[Bools], dive: int, setting
         # A gyroscope is at least as noisy as sights wander during rests, in its own frame.
         walk = max(float(np.median([one[-1] for one in turns])), 0.0) if turns else 0.0
         for from_ns, to_ns, angle, seconds, scatter, _ in turns:
-            drift = math.radians(settings.gyro_wander_dps) * seconds
             noise = math.sqrt((math.radians(settings.gyro_noise_dps_rthz) ** 2 + walk) * seconds)
             found.append(
                 Turn(
@@ -49,7 +48,7 @@ def turns_of(readings: PairReadings, chosen: Sequence[Bools], dive: int, setting
                     to_ns=to_ns,
                     seconds=round(seconds, 3),
                     angle_deg=round(math.degrees(angle), 4),
-                    sigma_deg=round(math.degrees(math.hypot(drift, noise, scatter)), 4),
+                    sigma_deg=round(math.degrees(math.hypot(noise, scatter)), 4),
                 )
             )
     return found
