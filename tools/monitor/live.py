@@ -114,6 +114,8 @@ def run(args: argparse.Namespace) -> int:
     from buddyline.tools.monitor.overview import Overview
 
     client = LiveClient("monitor", client_config(args), args.seconds)
+    # Before the link is printed: who reads it may end this at once.
+    client.handle_signals()
     overview = Overview(args.pair)
     session = LiveSession(overview, SystemClock())
     page = open_page(args, "Buddyline", lambda: session, live=True)
