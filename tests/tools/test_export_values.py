@@ -323,12 +323,18 @@ def ros2(messages: list[Message], path: Path) -> Iterator[tuple[str, Any, Any]]:
                 yield "velocity", R @ xyz(value.twist.twist.linear), told.v_a_b_mps
                 yield "velocity covariance", (R @ whole @ R.T).ravel(), told.v_covariance
     moved = [t for tf in found["/tf"] for t in tf.transforms if t.child_frame_id == "b_camera"]
-    # Before the first sample of the track a pose places B.
-    placed = [of(messages, RelativePose)[0], *of(messages, Track)]
-    for one, told in zip(moved, placed, strict=True):
-        yield "tf time", stamp_of(one.header), told.stamp_ns
-        yield "tf", xyz(one.transform.translation), told.t_a_b_m
-        yield "tf turn", matrix(xyzw(one.transform.rotation)), matrix(told.q_a_b_xyzw)
+    # A pose places B, then the first sample of the track, until the net does: a frame has one parent.
+    placed = [of(messages, RelativePose)[0], of(messages, Track)[0]]
+    by_a = [(one.stamp_ns, "a_camera", one.t_a_b_m, matrix(one.q_a_b_xyzw)) for one in placed]
+    by_net = [
+        (one.stamp_ns, "net_main", ENU_NED @ one.p_m, ENU_NED @ matrix(one.q_xyzw))
+        for one in of(messages, NodePose, node="b")
+    ]
+    for one, (stamp_ns, parent, t_m, R) in zip(moved, [*by_a, *by_net], strict=True):
+        assert one.header.frame_id == parent
+        yield "tf time", stamp_of(one.header), stamp_ns
+        yield "tf", xyz(one.transform.translation), t_m
+        yield "tf turn", matrix(xyzw(one.transform.rotation)), R
     # sensor_msgs/Range has single precision.
     ranges = {np.float32(one.range_m) for one in (*of(messages, Track), *of(messages, RelativePose))}
     assert {np.float32(one.range) for one in found["/buddyline/a/b/range"]} <= ranges
