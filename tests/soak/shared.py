@@ -122,7 +122,8 @@ class LiveDive:
         self.expected: set[tuple[str, str, int]] = set()
         self._messages, self._period_ns = messages, round(S_NS / rate_hz)
         self._nodes = sorted({one.node for one in messages})
-        self._publishers = {(topic_of(one), one.node): bus.publisher(topic_of(one), one.node) for one in messages}
+        said = {(topic_of(one), one.node) for one in messages}
+        self._publishers = {(topic, node): bus.publisher(topic, node) for topic, node in said}
         bus.subscribe((POSE.key_any(), REJECTED.key_any(), NET_POSE.key_any()), self.told.take, capacity=100_000)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
