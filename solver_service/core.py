@@ -266,7 +266,7 @@ class SolverCore:
             live = receive_ns is not None and abs(receive_ns - message.stamp_ns) < LIVE_WITHIN_NS
             others_ns = [s.newest_ns for s in self.streams.values() if s is not stream and s.newest_ns is not None]
             arrival = stream.add_frame(message, others_ns, now_ns, live=live)
-            if arrival is Arrival.CLOCK_SET and self.network is not None:
+            if arrival in (Arrival.LATER, Arrival.CLOCK_SET) and self.network is not None:
                 self.network.forget()
             if now_ns is not None:
                 self.health.saw_frame(stream.node, message.stamp_ns, now_ns)

@@ -114,8 +114,8 @@ class PairMatcher:
             self.late += 1
             seconds = (frame.stamp_ns - (self.streams[side].newest_ns or 0)) / S_NS
             detail = f"frame of {frame.node} is {seconds:+.1f} s from the node's others"
-            # It may be the first frame of a new time line: its outcome is stored for that one.
-            return self._give_up(frame, "late", detail, ahead=1) if due else []
+            # An earlier one may be the first of a new time line: its outcome is stored for that one.
+            return self._give_up(frame, "late", detail, ahead=int(seconds < 0)) if due else []
         if not (due or may_repeat):
             self.late += 1
             return []

@@ -40,13 +40,15 @@ class Arrival(Enum):
     """The verdict on a frame.
 
     FRESH: usable. DUPLICATE: came before. CONFLICT: another frame has its trigger. FAR: its stamp is far from the
-    node's newest. CLOCK_SET: the node's clock was set, and a new time line begins with it.
+    node's newest. LATER: a long gap ends, or the node's clock was set forward. CLOCK_SET: the node's clock was set
+    back, and a new time line begins with it: triggers may come again.
     """
 
     FRESH = "fresh"
     DUPLICATE = "duplicate"
     CONFLICT = "conflict"
     FAR = "far"
+    LATER = "later"
     CLOCK_SET = "clock_set"
 
 
@@ -239,10 +241,12 @@ class NodeStream:
         if len(self._far) < FRAMES_TO_BELIEVE:
             return Arrival.FAR
         self._far.clear()
+        self.first_ns = self.newest_ns = stamp_ns
+        if step_ns > 0:
+            return Arrival.LATER
         self.frames.clear()
         self._sequence.clear()
         self._newest_trigger = -1
-        self.first_ns = self.newest_ns = stamp_ns
         return Arrival.CLOCK_SET
 
     def _count_missing(self, receive_ns: int | None) -> None:

