@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from buddyline.protocol.messages import Message
+from buddyline.protocol.messages import Message, NodePose
 from buddyline.tools.cli import main
 
 from tests.tools.evaluated import INFOS, frame, pose, rejection, track, write_log
@@ -104,6 +104,31 @@ def test_a_recording_has_every_number_of_the_log_to_the_last_digit(rerun: Callab
         "world/trail_b Points3D:positions",
     ):
         assert drawn in found
+
+
+def test_nodes_of_a_net_stand_in_its_frame(rerun: Callable[..., str], tmp_path: Path) -> None:
+    placed = [
+        NodePose(
+            net="main", node=node, stamp_ns=at(k), p_m=(0.1 / 3 * k, -0.2 / 7, 3.0), q_xyzw=(0.5, 0.5, 0.5, 0.5),
+            v_mps=(0.1 / 3, 0.0, 0.0), covariance=(np.eye(6) / 7).ravel().tolist(), fixed=False, mode="smooth",
+            age_s=0.1 / 3,
+        )
+        for k in range(5)
+        for node in "ab"
+    ]  # fmt: skip
+    sensed = [each for k in range(5) for each in (attitude("a", at(k)), depth("a", at(k)), pose(k))]
+    log = write_log(tmp_path / "dive.mcap", *INFOS.values(), *sensed, *placed)
+    output = tmp_path / "dive.rrd"
+    rerun("python", "-P", "-m", "buddyline", "export", log, "--format", "rerun", "-o", str(output))
+    found = json.loads(rerun("python", "-c", READ, str(output)))
+    for one in placed:
+        for field in ("p_m", "q_xyzw", "v_mps", "covariance", "age_s"):
+            series = found[f"net/main/{one.node}/{field}"]
+            (value,) = [v for ns, v in series if ns == one.stamp_ns]
+            np.testing.assert_array_equal(value, np.ravel(getattr(one, field)))
+    for drawn in ("/a", "/b", ""):
+        assert f"world/net_main{drawn} Transform3D:translation" in found
+    assert not [name for name in found if name.startswith(("world/a", "world/b"))]
 
 
 def test_the_log_for_foxglove_is_drawn_without_set_up(rerun: Callable[..., str], tmp_path: Path) -> None:

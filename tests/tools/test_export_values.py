@@ -271,18 +271,24 @@ def foxglove(messages: list[Message], path: Path) -> Iterator[tuple[str, Any, An
         topics = {c.topic for c in reader.get_summary().channels.values() if c.message_encoding == "protobuf"}  # type: ignore[union-attr]
         for _, channel, _, message in reader.iter_decoded_messages(topics=topics):
             found.setdefault(channel.topic, []).append(message)
-    for kind in (Attitude, Depth, RelativePose, Track, Rejected, NodeStatus, SolverStatus):
+    for kind in (Attitude, Depth, RelativePose, Track, Rejected, NodeStatus, SolverStatus, NodePose):
         told = [json.loads(encode(one)) for one in of(messages, kind)]
         assert plain[f"buddyline.{kind.__name__}"] == told, kind
     for placed, told in zip(found["/pair/a/b/pose"], of(messages, RelativePose), strict=True):
         yield "time", placed.timestamp.seconds * S_NS + placed.timestamp.nanos, told.stamp_ns
         yield "pose", [*xyz(placed.pose.position)], told.t_a_b_m
         yield "turn", matrix(xyzw(placed.pose.orientation)), matrix(told.q_a_b_xyzw)
-    moved = [t for tf in found["/tf"] for t in tf.transforms if t.child_frame_id == "b_camera"]
-    for one, told in zip(moved, of(messages, Track), strict=True):
-        yield "tf", xyz(one.translation), told.t_a_b_m
-        yield "tf turn", matrix(xyzw(one.rotation)), matrix(told.q_a_b_xyzw)
     for node in "ab":
+        moved = [t for tf in found["/tf"] for t in tf.transforms if t.child_frame_id == f"{node}_camera"]
+        in_net = zip(moved, found[f"/net/main/{node}/pose"], of(messages, NodePose, node=node), strict=True)
+        for one, placed, told in in_net:
+            assert one.parent_frame_id == placed.frame_id == "net_main"
+            for where, q in (
+                (one.translation, one.rotation),
+                (placed.pose.position, placed.pose.orientation),
+            ):
+                yield "net place", xyz(where), ENU_NED @ told.p_m
+                yield "net turn", matrix(xyzw(q)), ENU_NED @ matrix(told.q_xyzw)
         known = of(messages, NodeInfo, node=node)[0]
         (entity,) = found[f"/{node}/rig"][-1].entities
         yield "lamps", [xyz(s.pose.position) for s in entity.spheres], [known.light_left_m, known.light_right_m]
@@ -348,6 +354,38 @@ def ros2(messages: list[Message], path: Path) -> Iterator[tuple[str, Any, Any]]:
     yield "uptime", float(said["buddyline: node a"]["uptime s"]), 100 / 3
 
 
+AXES = ("north", "east", "down")
+
+
+def of_nodes(messages: list[Message], rows: list[dict[str, Any]]) -> Iterator[tuple[str, Any, Any]]:
+    """The rows of all nodes, of csv or Parquet."""
+    turned = (*AXES, *(f"w_{axis}" for axis in AXES))
+    for row, told in zip(rows, of(messages, NodePose), strict=True):
+        covariance = np.array(told.covariance).reshape(6, 6)
+        expected: dict[str, Any] = {"stamp_ns": told.stamp_ns, "age_s": told.age_s, "fixed": int(told.fixed)}
+        expected |= {f"{axis}_m": x for axis, x in zip(AXES, told.p_m, strict=True)}
+        expected |= {f"v_{axis}_mps": x for axis, x in zip(AXES, told.v_mps, strict=True)}
+        expected |= {f"q_{axis}": x for axis, x in zip("xyzw", told.q_xyzw, strict=True)}
+        for i, axis in enumerate(turned):
+            expected[f"sd_{axis}_{'m' if i < 3 else 'rad'}"] = math.sqrt(covariance[i, i])
+            expected |= {f"cov_{axis}_{turned[k]}": covariance[i, k] for k in range(i, 6)}
+        named = {"net": told.net, "node": told.node, "mode": told.mode}
+        assert {name: row[name] for name in named} == named
+        assert set(row) == {*expected, *named}
+        for name, value in expected.items():
+            yield name, float(row[name]) if name != "stamp_ns" else int(row[name]), value
+
+
+def net_csv(messages: list[Message], path: Path) -> Iterator[tuple[str, Any, Any]]:
+    with open(path, newline="") as file:
+        yield from of_nodes(messages, list(csv.DictReader(file)))
+
+
+def net_parquet(messages: list[Message], path: Path) -> Iterator[tuple[str, Any, Any]]:
+    reader = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
+    yield from of_nodes(messages, reader.read_table(path).to_pylist())
+
+
 READERS: dict[str, Reader] = {
     "tum": tum,
     "csv": of_csv,
@@ -364,11 +402,22 @@ READERS: dict[str, Reader] = {
 # rerun's reader needs an environment of its own: tests/tools/test_export_rerun.py.
 @pytest.mark.parametrize("name", [form.name for form in FORMATS if form.name != "rerun"])
 def test_every_number_read_back_equals_the_log(name: str, dive: tuple[list[Message], Path], tmp_path: Path) -> None:
-    messages, log = dive
     output = tmp_path / ("out.mcap" if name == "mcap-ros2" else f"out.{name}")
-    assert main(["export", str(log), "--format", name, "-o", str(output)]) == 0
+    compare(dive, ["--format", name], READERS[name], output)
+
+
+@pytest.mark.parametrize(("name", "reader"), [("csv", net_csv), ("parquet", net_parquet)])
+def test_every_number_of_all_nodes_equals_the_log(
+    name: str, reader: Reader, dive: tuple[list[Message], Path], tmp_path: Path
+) -> None:
+    compare(dive, ["--format", name, "--what", "net"], reader, tmp_path / f"out.{name}")
+
+
+def compare(dive: tuple[list[Message], Path], words: list[str], reader: Reader, output: Path) -> None:
+    messages, log = dive
+    assert main(["export", str(log), *words, "-o", str(output)]) == 0
     compared = 0
-    for what, found, told in READERS[name](messages, output):
+    for what, found, told in reader(messages, output):
         if isinstance(told, int):
             assert found == told, what
         np.testing.assert_allclose(found, told, rtol=0, atol=1e-9, err_msg=what)

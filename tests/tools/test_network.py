@@ -160,6 +160,8 @@ def test_export_c3d_has_the_same_markers_as_trc(solved, tmp_path):
         (["--format", "csv", "--what", "net", "--node", "z"], "nothing of node z"),
         (["--format", "tum", "--node", "b"], "--node"),
         (["--format", "trc", "--what", "poses"], "--what poses"),
+        (["--format", "csv", "--what", "net", "--pair", "a/b"], "--pair: not with all nodes"),
+        (["--format", "foxglove", "-o", "x.mcap", "--pair", "a/b"], "it has all nodes and pairs"),
     ],
 )
 def test_what_cannot_be_exported_is_said(solved, capsys, words, named):
@@ -167,16 +169,28 @@ def test_what_cannot_be_exported_is_said(solved, capsys, words, named):
     assert named in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("form", ["tum", "csv"])
-def test_of_several_pairs_in_a_net_one_or_all_nodes_are_to_be_chosen(tmp_path, capsys, form):
+@pytest.mark.parametrize("form", ["tum", "csv", "parquet"])
+def test_of_several_pairs_in_a_net_one_or_all_nodes_are_to_be_chosen(tmp_path, capsys, monkeypatch, form):
+    monkeypatch.chdir(tmp_path)
     pairs = [replace(evaluated.pose(0), node_a=one, node_b=two) for one, two in ("ab", "bc")]
     log = write(tmp_path / "net.mcap", info("a"), info("b"), info("c"), *pairs, pose("b", 0, (1.0, 0.0, 0.0)))
-    assert main(["export", log, "--format", form]) == 2
+    assert main(["export", log, "--format", form, "-o", "out"]) == 2
     said = "holds pairs a/b, b/c; choose one with --pair A/B, or all nodes with --what net"
     assert said in capsys.readouterr().err
     without = write(tmp_path / "pairs.mcap", info("a"), info("b"), info("c"), *pairs)
-    assert main(["export", without, "--format", form]) == 2
+    assert main(["export", without, "--format", form, "-o", "out"]) == 2
     assert "--what net" not in capsys.readouterr().err
+
+
+def test_parquet_has_the_pair_or_the_node_that_is_asked_for(tmp_path):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    pairs = [replace(evaluated.pose(0), node_a=one, node_b=two) for one, two in ("ab", "bc")]
+    log = write(tmp_path / "net.mcap", info("a"), info("b"), info("c"), *pairs, pose("b", 0, (1.0, 0.0, 0.0)))
+    of_pair, of_node = tmp_path / "pair.parquet", tmp_path / "node.parquet"
+    assert main(["export", log, "--format", "parquet", "--pair", "b/c", "-o", str(of_pair)]) == 0
+    assert parquet.read_table(of_pair)["node_b"].to_pylist() == ["c"]
+    assert main(["export", log, "--format", "parquet", "--what", "net", "--node", "b", "-o", str(of_node)]) == 0
+    assert parquet.read_table(of_node)["north_m"].to_pylist() == [1.0]
 
 
 def test_a_log_without_a_net_is_said(tmp_path, capsys):

@@ -7,6 +7,7 @@ import math
 import sys
 from collections.abc import Iterable, Iterator
 from importlib import import_module
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -66,24 +67,57 @@ def run(args: argparse.Namespace) -> int:
     form = format_of(args.format)
     if args.truth and args.format != "tum":
         raise BuddylineError("--truth: only with --format tum")
-    if args.rejected and args.format != "csv":
-        raise BuddylineError("--rejected: only with --format csv")
+    if args.rejected and not form.table:
+        raise BuddylineError("--rejected: only with --format csv or parquet")
     if args.what == "track" and (args.truth or args.rejected):
         raise BuddylineError(f"--what track: not with {'--truth' if args.truth else '--rejected'}")
-    of_net = args.format == "trc" or (args.what == "net" and not form.of_net)
+    of_net = args.format == "trc" or args.what == "net"
     if args.node is not None and not of_net:
         raise BuddylineError("--node: only with --what net")
-    if form.module and not of_net:
+    if form.module and args.output is None:
+        raise BuddylineError(f"--format {form.name}: give -o FILE")
+    if form.module and not form.table:
         return _export_file(args, form)
+    of_pair = {
+        f"--what {args.what}": args.what in ("poses", "track"),
+        "--truth": args.truth,
+        "--rejected": args.rejected,
+        "--pair": args.pair is not None,
+    }
+    if of_net and any(of_pair.values()):
+        given = ", ".join(name for name, is_given in of_pair.items() if is_given)
+        raise BuddylineError(f"{given}: not with all nodes of a net")
     if args.output is not None:
         check_new(args.output)
-    what, lines = _network_lines(args) if of_net else _lines(args, _of_pair(args))
-    if args.output is None:
-        sys.stdout.writelines(lines)
+    if form.table:
+        what = _write_table(args, form)
     else:
-        write_new(args.output, "".join(lines))
+        what, lines = _network_lines(args) if of_net else _lines(args, _of_pair(args))
+        _write_text(args.output, lines)
     print(f"{', '.join(args.logs)}: {what}", file=sys.stderr)
     return 0
+
+
+def _write_table(args: argparse.Namespace, form: ExportFormat) -> str:
+    """Write rows and columns; return what they are of, in words."""
+    if args.what == "net":
+        from buddyline.tools.export.network import network_rows
+
+        said, names, rows = network_rows(args.logs, args.node)
+    else:
+        said, names, rows = rows_of(_of_pair(args), args.what, ", ".join(args.logs), rejected=args.rejected)
+    if form.module:
+        import_module(f"buddyline.tools.export.{form.module}").write(args.output, said, names, rows)
+    else:
+        _write_text(args.output, csv_lines(names, ([row.get(name, "") for name in names] for row in rows)))
+    return said
+
+
+def _write_text(output: Path | None, lines: Iterable[str]) -> None:
+    if output is None:
+        sys.stdout.writelines(lines)
+    else:
+        write_new(output, "".join(lines))
 
 
 def _of_pair(args: argparse.Namespace) -> Recorded:
@@ -102,11 +136,8 @@ def _lines(args: argparse.Namespace, recorded: Recorded) -> tuple[str, Iterator[
         if not recorded.truths:
             raise BuddylineError(f"{name}: no truth in it")
         return f"the truth, {len(recorded.truths)} rows", tum_lines(recorded.truths)
-    if args.format == "tum":
-        said, estimates = chosen(recorded, args.what, name)
-        return said, tum_lines(estimates)
-    said, names, rows = rows_of(recorded, args.what, name, rejected=args.rejected)
-    return said, csv_lines(names, ([row.get(name, "") for name in names] for row in rows))
+    said, estimates = chosen(recorded, args.what, name)
+    return said, tum_lines(estimates)
 
 
 def chosen(recorded: Recorded, what: str | None, name: str) -> tuple[str, list[RelativePose] | list[Track]]:
@@ -147,20 +178,20 @@ def rows_of(
 def _network_lines(args: argparse.Namespace) -> tuple[str, Iterator[str]]:
     from buddyline.tools.export.network import network_lines
 
-    if args.what not in (None, "net") or format_of(args.format).module or args.truth or args.rejected or args.pair:
-        raise BuddylineError(f"--format {args.format} --what {args.what}: all nodes go as tum, csv or trc, alone")
     return network_lines(args.logs, args.format, args.node, str(args.output or "buddyline.trc"))
 
 
 def _export_file(args: argparse.Namespace, form: ExportFormat) -> int:
-    from buddyline.tools.dives import Dive
+    from buddyline.tools.dives import Dive, first_with_net
 
-    if args.output is None:
-        raise BuddylineError(f"--format {form.name}: give -o FILE")
     if form.of_net and args.what not in (None, "net"):
         raise BuddylineError(f"--format {form.name} --what {args.what}: it has all nodes")
+    if args.node is not None or args.pair is not None:
+        raise BuddylineError(f"--format {form.name}: it has all nodes and pairs, without --node and --pair")
     module = import_module(f"buddyline.tools.export.{form.module}")
     with Dive(args.logs) as dive:
+        if args.what == "net":
+            first_with_net([dive])
         count = module.export(dive, args.output, args.what)
     print(f"{args.output}: {count} {form.counts}", file=sys.stderr)
     return 0

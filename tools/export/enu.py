@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.messages import Attitude, Depth, NodeInfo
+from buddyline.protocol.messages import Attitude, Depth, NodeInfo, NodePose
 from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from numpy.typing import NDArray
 
@@ -44,6 +44,25 @@ class FrameTree:
             return False
         self._placed[frame] = parent, now_ns
         return True
+
+
+def net_enu(pose: NodePose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return a node's place (3,) in m and R (3, 3) of its camera, in its net's frame turned to east, north, up."""
+    return R_ENU_NED @ np.array(pose.p_m), R_ENU_NED @ quat_to_matrix(np.array(pose.q_xyzw))
+
+
+class NetDepths:
+    """How deep the zero of each net is: as one of its nodes says, the first with a depth."""
+
+    def __init__(self) -> None:
+        self._sounded: dict[str, str] = {}
+
+    def up_m(self, pose: NodePose, camera: BaseCamera) -> float | None:
+        """Return how high the net's zero is in the world; None where this node's depth does not say it."""
+        above_m = float(camera.position_m(pose.node)[2])
+        if not above_m or self._sounded.setdefault(pose.net, pose.node) != pose.node:
+            return None
+        return above_m + pose.p_m[2]
 
 
 class BaseCamera:

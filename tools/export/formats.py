@@ -8,10 +8,11 @@ from typing import Final
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """A format. module: beside this one, with export(dive, output, what) -> number of messages or rows.
+    """A format. module: beside this one, with export(dive, output, what) -> number of messages or frames.
 
     "": text, which command.py writes to a file or to standard output. counts: what its number is of. of_net: it
-    has all nodes of a net, whatever is asked for.
+    has all nodes of a net, whatever is asked for. table: rows and columns; its module has
+    write(output, said, names, rows).
     """
 
     name: str
@@ -19,11 +20,12 @@ class ExportFormat:
     module: str = ""
     counts: str = "messages"
     of_net: bool = False
+    table: bool = False
 
 
 FORMATS: Final = (
     ExportFormat("tum", "t x y z qx qy qz qw, for evo and others"),
-    ExportFormat("csv", "a row for each sample, units in the header"),
+    ExportFormat("csv", "a row for each sample, units in the header", table=True),
     ExportFormat("trc", "all nodes and their lamps as markers, for motion capture programs"),
     ExportFormat("c3d", "the same as C3D, which most of them read (extra `c3d`)", "c3d", "frames", of_net=True),
     ExportFormat(
@@ -34,7 +36,9 @@ FORMATS: Final = (
         of_net=True,
     ),
     ExportFormat("metashape", "the same with cameras.xml for Metashape", "metashape", "pictures", of_net=True),
-    ExportFormat("parquet", "the columns of csv, typed, for pandas and others (extra `parquet`)", "parquet", "rows"),
+    ExportFormat(
+        "parquet", "the columns of csv, typed, for pandas and others (extra `parquet`)", "parquet", table=True
+    ),
     ExportFormat(
         "foxglove",
         "a log with scene, pictures, marks, path, series and log for Foxglove and Lichtblick, and a layout beside it",

@@ -1,16 +1,18 @@
 """A dive as Foxglove's own messages, which Foxglove, Lichtblick and rerun draw without any set-up.
 
 World is east, north, up with its origin on the surface above A, or at A where no depth is known. A stands in it by
-its attitude and depth, and B in A's camera frame by the track, or by the poses where there is no track. B's path is a
-line: of the track's places in north-east-down, as seen from A. Both rigs are a scene; what nodes and solver report, and
-why a trigger gave no pose, is a log. For plots the log's own messages follow, byte for byte (JSON with schema), under
-their own keys. Beside OUTPUT lies OUTPUT.layout.json: import it as a layout, and all of it is in place.
+its attitude and depth, and B in A's camera frame by the track, or by the poses where there is no track. Nodes of a net
+stand in the net's frame (`net_main`, here east, north, up), which is as deep in the world as a node of it says. A
+node's path is a line: of its places in the net, or of the track's in north-east-down, as seen from A. All rigs are a
+scene; what nodes and solver report, and why a trigger gave no pose, is a log. For plots the log's own messages follow,
+byte for byte (JSON with schema), under their own keys. Beside OUTPUT lies OUTPUT.layout.json: import it as a layout,
+and all of it is in place.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,14 +29,15 @@ from buddyline.protocol.messages import (
     Depth,
     Message,
     NodeInfo,
+    NodePose,
     RelativePose,
     Track,
 )
 from buddyline.protocol.schemas import json_schema
-from buddyline.protocol.topics import TRACK, TRACK_LAG
+from buddyline.protocol.topics import NET_POSE, TRACK, TRACK_LAG
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
 from buddyline.tools.dives import Dive
-from buddyline.tools.export.enu import R_ENU_NED, BaseCamera, FrameTree
+from buddyline.tools.export.enu import R_ENU_NED, BaseCamera, FrameTree, NetDepths, net_enu
 from buddyline.tools.export.foxglove_layout import LOG, TRANSFORMS, WORLD, layout
 from buddyline.tools.extras import needed
 from buddyline.tools.health.words import Sayings
@@ -54,26 +57,37 @@ SERIES: Final = (
     *("pose", "track", "track_lag", "rejected", "truth", "attitude", "depth", "node_status", "solver_status"),
     *("info", "net_pose", "net_truth"),
 )
+NO_NETS: Final[Mapping[str, str]] = {}
 LEFT, RIGHT, OTHER = (1.0, 0.25, 0.25), (0.54, 1.0, 0.76), (1.0, 0.83, 0.3)
 
 
 class FoxgloveTranslation:
-    """Translates a dive's messages into Foxglove's, one by one. tracked: pairs whose track, not poses, places B."""
+    """Translates a dive's messages into Foxglove's, one by one.
 
-    def __init__(self, schemas: Any, tracked: Collection[tuple[str, ...]] = ()) -> None:
+    tracked: pairs whose track, not poses, places B. nets: the net of each node that a net places, and nothing else.
+    """
+
+    def __init__(
+        self, schemas: Any, tracked: Collection[tuple[str, ...]] = (), nets: Mapping[str, str] = NO_NETS
+    ) -> None:
         self._fox = schemas
         self._tracked = set(tracked)
+        self._nets = nets
+        self._depths = NetDepths()
         self._paths: dict[tuple[str, str], list[Track]] = {}
+        self._net_paths: dict[tuple[str, str], list[NodePose]] = {}
         self._frames: dict[str, deque[Candidates]] = {}
         self._camera = BaseCamera()
         self._tree = FrameTree()
         self._sayings = Sayings()
 
     def start(self, infos: dict[str, NodeInfo], base: str | None, at_ns: int) -> Iterator[tuple[str, int, Any]]:
-        """Yield the messages before the dive's first: A level at the origin. base: A's id."""
+        """Yield the messages before the dive's first: A level at the origin, or the net. base: A's id."""
         self._camera.infos.update(infos)
         self._camera.base = base
-        if base is not None:
+        for net in sorted(set(self._nets.values())):
+            yield TRANSFORMS, at_ns, self._transform(WORLD, f"net_{net}", np.zeros(3), np.eye(3), at_ns)
+        if base is not None and base not in self._nets:
             yield TRANSFORMS, at_ns, self._transform(WORLD, f"{base}_camera", np.zeros(3), R_ENU_LEVEL, at_ns)
 
     def messages(self, envelope: Envelope) -> Iterator[tuple[str, int, Any]]:
@@ -95,6 +109,8 @@ class FoxgloveTranslation:
             yield from self._pose(message)
         elif isinstance(message, Track):
             yield from self._track(message)
+        elif isinstance(message, NodePose) and envelope.topic is NET_POSE:
+            yield from self._node_pose(message)
         for name, level, text in self._sayings.new(message):
             fox, at = self._fox, self._time(envelope.stamp_ns)
             line = fox.Log(timestamp=at, level=getattr(fox.LogLevel, level), name=name, message=text)
@@ -139,7 +155,7 @@ class FoxgloveTranslation:
     def _attitude(self, attitude: Attitude) -> Iterator[tuple[str, int, Any]]:
         node, stamp_ns = attitude.node, attitude.stamp_ns
         R = self._camera.orientation(attitude)
-        if R is not None:
+        if R is not None and node not in self._nets:
             position_m = self._camera.position_m(node)
             yield TRANSFORMS, stamp_ns, self._transform(WORLD, f"{node}_camera", position_m, R, stamp_ns)
 
@@ -200,9 +216,9 @@ class FoxgloveTranslation:
                 yield f"/{node}/camera/chosen", frame.stamp_ns, self._chosen(frame, chosen)
 
     def _places(self, estimate: Track | RelativePose) -> bool:
-        """Return whether it places B: not where another pair does, nor the node that stands in the world."""
+        """Return whether it places B: not where a net or another pair does, nor the node that stands in the world."""
         a, b = estimate.node_a, estimate.node_b
-        return b != self._camera.base and self._tree.place(a, b, estimate.stamp_ns)
+        return b != self._camera.base and b not in self._nets and self._tree.place(a, b, estimate.stamp_ns)
 
     def _track(self, track: Track) -> Iterator[tuple[str, int, Any]]:
         base, child = f"{track.node_a}_camera", f"{track.node_b}_camera"
@@ -215,20 +231,56 @@ class FoxgloveTranslation:
             yield self._path(piece)
             piece[:] = [track]
 
+    def _node_pose(self, pose: NodePose) -> Iterator[tuple[str, int, Any]]:
+        """Yield a node's pose in its net's frame, the transform, and how deep the net's frame is."""
+        fox, stamp_ns, frame = self._fox, pose.stamp_ns, f"net_{pose.net}"
+        at_m, R = net_enu(pose)
+        yield TRANSFORMS, stamp_ns, self._transform(frame, f"{pose.node}_camera", at_m, R, stamp_ns)
+        placed = fox.PoseInFrame(
+            timestamp=self._time(stamp_ns),
+            frame_id=frame,
+            pose=fox.Pose(position=self._vector(at_m), orientation=self._quaternion(R)),
+        )
+        yield f"/net/{pose.net}/{pose.node}/pose", stamp_ns, placed
+        up_m = self._depths.up_m(pose, self._camera)
+        if up_m is not None:
+            net_m = np.array([0.0, 0.0, up_m])
+            yield TRANSFORMS, stamp_ns, self._transform(WORLD, frame, net_m, np.eye(3), stamp_ns)
+        piece = self._net_paths.setdefault((pose.net, pose.node), [])
+        piece.append(pose)
+        if stamp_ns - piece[0].stamp_ns >= PATH_NS:
+            yield self._net_path(piece)
+            piece[:] = [pose]
+
     def paths(self) -> Iterator[tuple[str, int, Any]]:
         """Yield the unfinished pieces of the paths, at the end of the dive."""
         for piece in self._paths.values():
             if len(piece) > 1:
                 yield self._path(piece)
+        for in_net in self._net_paths.values():
+            if len(in_net) > 1:
+                yield self._net_path(in_net)
 
     def _path(self, piece: list[Track]) -> tuple[str, int, Any]:
         """Return a piece of B's path: in the world if A's attitude is known, else in A's camera frame."""
-        fox, first = self._fox, piece[0]
+        first = piece[0]
         known = [one.t_ned_m for one in piece if one.t_ned_m is not UNSET]
         if len(known) == len(piece):
             frame, points_m = WORLD, np.array(known) @ R_ENU_NED.T + self._camera.position_m(first.node_a)
         else:
             frame, points_m = f"{first.node_a}_camera", np.array([one.t_a_b_m for one in piece])
+        scene = self._line(frame, f"path {first.stamp_ns}", first.stamp_ns, points_m)
+        return f"/pair/{first.node_a}/{first.node_b}/path", piece[-1].stamp_ns, scene
+
+    def _net_path(self, piece: list[NodePose]) -> tuple[str, int, Any]:
+        """Return a piece of a node's path in its net's frame."""
+        first, points_m = piece[0], np.array([pose.p_m for pose in piece]) @ R_ENU_NED.T
+        scene = self._line(f"net_{first.net}", f"path {first.node} {first.stamp_ns}", first.stamp_ns, points_m)
+        return f"/net/{first.net}/{first.node}/path", piece[-1].stamp_ns, scene
+
+    def _line(self, frame: str, name: str, stamp_ns: int, points_m: Any) -> Any:
+        """Return points (n, 3) of a frame as a line of the scene. name: its own."""
+        fox = self._fox
         line = fox.LinePrimitive(
             type=fox.LinePrimitiveLineType.LineStrip,
             pose=fox.Pose(position=self._vector(np.zeros(3)), orientation=self._quaternion(np.eye(3))),
@@ -237,11 +289,8 @@ class FoxgloveTranslation:
             points=[fox.Point3(x=x, y=y, z=z) for x, y, z in points_m.tolist()],
             color=fox.Color(r=OTHER[0], g=OTHER[1], b=OTHER[2], a=1.0),
         )
-        entity = fox.SceneEntity(
-            timestamp=self._time(first.stamp_ns), frame_id=frame, id=f"path {first.stamp_ns}", lines=[line]
-        )
-        stamp_ns = piece[-1].stamp_ns
-        return f"/pair/{first.node_a}/{first.node_b}/path", stamp_ns, fox.SceneUpdate(entities=[entity])
+        entity = fox.SceneEntity(timestamp=self._time(stamp_ns), frame_id=frame, id=name, lines=[line])
+        return fox.SceneUpdate(entities=[entity])
 
     def _chosen(self, frame: Candidates, chosen: tuple[int, int]) -> Any:
         fox = self._fox
@@ -301,7 +350,8 @@ def export(dive: Dive, output: Path, what: str | None = None) -> int:
     layout_path = output.with_name(f"{output.name}.layout.json")
     check_new(layout_path)
     track = track_of(dive, what)
-    translation = FoxgloveTranslation(fox, dive.ids(track) if track else ())
+    nets = nets_of(dive)
+    translation = FoxgloveTranslation(fox, dive.ids(track) if track else (), nets)
     cut_ns = 0
     with new_file(output) as part, open(part, "xb") as file:
         writer = Writer(file, compression=CompressionType.ZSTD)
@@ -317,7 +367,9 @@ def export(dive: Dive, output: Path, what: str | None = None) -> int:
                 channels.add(topic, stamp_ns, message)
         writer.finish()
     pair = next((ids for ids in dive.ids("pose", "track", "track_lag")), None)
-    write_new(layout_path, layout(channels.topics, None if pair is None else (pair[0], pair[1]), base_of(dive)))
+    # A net is looked at from outside, a pair from A.
+    base = None if nets else base_of(dive)
+    write_new(layout_path, layout(channels.topics, None if pair is None else (pair[0], pair[1]), base))
     return channels.count
 
 
@@ -391,3 +443,8 @@ def base_of(dive: Dive) -> str | None:
     for ids in dive.ids("pose", "track", "track_lag"):
         return ids[0]
     return next(iter(dive.nodes("info", "candidates", "image")), None)
+
+
+def nets_of(dive: Dive) -> dict[str, str]:
+    """Return the net of each node that a net places."""
+    return {node: net for net, node in dive.ids(NET_POSE.name)}

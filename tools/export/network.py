@@ -1,4 +1,4 @@
-"""Export all nodes of a net: TUM a node, one CSV, or TRC for motion capture programs."""
+"""Export all nodes of a net: TUM a node, one table, or TRC for motion capture programs."""
 
 from __future__ import annotations
 
@@ -16,32 +16,47 @@ from buddyline.protocol.topics import NET_POSE
 from buddyline.tools.columns import in_order
 from buddyline.tools.dives import first_with_net, open_each
 from buddyline.tools.evaluation.rotation import Floats, normalized, rotate
-from buddyline.tools.measure.tables import csv_lines, tum_line
+from buddyline.tools.measure.tables import tum_line
 
-_CSV: Final = (
+_AXES: Final = ("north", "east", "down", "w_north", "w_east", "w_down")
+_UPPER: Final = [(row, column) for row in range(6) for column in range(row, 6)]
+_COLUMNS: Final = (
     *("stamp_ns", "net", "node", "fixed", "mode", "north_m", "east_m", "down_m", "q_x", "q_y", "q_z", "q_w"),
     *("v_north_mps", "v_east_mps", "v_down_mps", "sd_north_m", "sd_east_m", "sd_down_m"),
     *("sd_w_north_rad", "sd_w_east_rad", "sd_w_down_rad", "age_s"),
+    # The row-major upper triangle, in m and rad.
+    *(f"cov_{_AXES[row]}_{_AXES[column]}" for row, column in _UPPER),
 )
 _NORTH_UP_EAST: Final = np.array(((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)))
 
 
 def network_lines(logs: Sequence[str], form: str, node: str | None, name: str) -> tuple[str, Iterator[str]]:
-    """Return what is exported, in words, and its lines. form: "tum", "csv" or "trc"; name: of the file."""
+    """Return what is exported, in words, and its lines. form: "tum" or "trc"; name: of the file."""
+    said, poses, infos = _chosen(logs, node)
+    if form == "trc":
+        return said, _trc_lines(_markers_of(poses, infos), name)
+    if node is None:
+        known = ", ".join(sorted({pose.node for pose in poses}))
+        raise BuddylineError(f"--format tum --what net: one node a file; choose with --node: {known}")
+    return said, (tum_line(pose.stamp_ns, pose.p_m, pose.q_xyzw) for pose in poses)
+
+
+def network_rows(logs: Sequence[str], node: str | None) -> tuple[str, tuple[str, ...], list[dict[str, object]]]:
+    """Return what is exported, in words, its columns, and its rows by time."""
+    said, poses, _ = _chosen(logs, node)
+    return said, _COLUMNS, [dict(zip(_COLUMNS, _row(pose), strict=True)) for pose in poses]
+
+
+def _chosen(logs: Sequence[str], node: str | None) -> tuple[str, list[NodePose], dict[str, NodeInfo]]:
+    """Return what is exported, in words, the poses of a node or of all, by time, and all nodes' calibrations."""
     poses, infos = _load(logs)
     known = sorted({pose.node for pose in poses})
     if node is not None:
         poses = [pose for pose in poses if pose.node == node]
     if not poses:
         raise BuddylineError(f"{', '.join(logs)}: nothing of node {node}; nodes: {', '.join(known)}")
-    said = f"{'node ' + node if node else 'nodes ' + ', '.join(known)} in the net's frame, {len(poses)} rows"
-    if form == "trc":
-        return said, _trc_lines(_markers_of(poses, infos), name)
-    if form == "csv":
-        return said, csv_lines(_CSV, map(_csv_row, poses))
-    if node is None:
-        raise BuddylineError(f"--format tum --what net: one node a file; choose with --node: {', '.join(known)}")
-    return said, (tum_line(pose.stamp_ns, pose.p_m, pose.q_xyzw) for pose in poses)
+    whose = f"node {node}" if node else f"nodes {', '.join(known)}"
+    return f"{whose} in the net's frame, {len(poses)} rows", poses, infos
 
 
 def _load(paths: Sequence[str]) -> tuple[list[NodePose], dict[str, NodeInfo]]:
@@ -59,10 +74,11 @@ def _load(paths: Sequence[str]) -> tuple[list[NodePose], dict[str, NodeInfo]]:
     return sorted(poses, key=lambda pose: pose.stamp_ns), infos
 
 
-def _csv_row(pose: NodePose) -> tuple[object, ...]:
+def _row(pose: NodePose) -> tuple[object, ...]:
     sigmas = [math.sqrt(max(variance, 0.0)) for variance in pose.covariance[::7]]
     head = (pose.stamp_ns, pose.net, pose.node, int(pose.fixed), pose.mode)
-    return (*head, *pose.p_m, *pose.q_xyzw, *pose.v_mps, *sigmas, pose.age_s)
+    covariances = [pose.covariance[6 * row + column] for row, column in _UPPER]
+    return (*head, *pose.p_m, *pose.q_xyzw, *pose.v_mps, *sigmas, pose.age_s, *covariances)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,28 +1,21 @@
-"""A dive's track or poses as a Parquet table: the columns of the CSV, typed."""
+"""The rows that CSV has, as a Parquet table with types."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from buddyline.tools.dives import Dive
 from buddyline.tools.extras import needed
 from buddyline.tools.newfile import new_file
 
 
-def export(dive: Dive, output: Path, what: str | None = None) -> int:
-    """Write the best track, or the poses, into output, which must not exist; return the number of rows."""
+def write(output: Path, said: str, names: Sequence[str], rows: Sequence[dict[str, object]]) -> None:
+    """Write rows into output, which must not exist. said: what they are of, in words; names: the columns."""
     pa, pq = (needed(name, "--format parquet", "parquet") for name in ("pyarrow", "pyarrow.parquet"))
-    from buddyline.tools.evaluation.logs import load
-    from buddyline.tools.export.command import rows_of
-
-    name, names, rows = rows_of(load([str(reader.path) for reader in dive.readers]), what, dive.name)
-    columns: dict[str, Any] = {field: [row.get(field, "") for row in rows] for field in names}
+    columns: dict[str, Any] = {name: [row.get(name, "") for row in rows] for name in names}
     # An unknown number is null, as an empty cell is in CSV.
-    arrays = {
-        field: pa.array([None if value == "" else value for value in values]) for field, values in columns.items()
-    }
-    table = pa.table(arrays).replace_schema_metadata({"buddyline": name})
+    arrays = {name: pa.array([None if value == "" else value for value in values]) for name, values in columns.items()}
+    table = pa.table(arrays).replace_schema_metadata({"buddyline": said})
     with new_file(output) as part:
         pq.write_table(table, part)
-    return len(rows)

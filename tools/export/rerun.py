@@ -20,12 +20,14 @@ from buddyline.protocol.messages import (
     CompressedImage,
     Depth,
     NodeInfo,
+    NodePose,
     RelativePose,
     Track,
 )
+from buddyline.protocol.topics import NET_POSE
 from buddyline.tools.dives import Dive
-from buddyline.tools.export.enu import BaseCamera
-from buddyline.tools.export.foxglove import LAMP_M, LEFT, OTHER, RIGHT, SERIES, base_of, track_of
+from buddyline.tools.export.enu import BaseCamera, NetDepths, net_enu
+from buddyline.tools.export.foxglove import LAMP_M, LEFT, OTHER, RIGHT, SERIES, base_of, nets_of, track_of
 from buddyline.tools.extras import needed
 from buddyline.tools.health.words import Sayings
 from buddyline.tools.newfile import new_file
@@ -52,7 +54,10 @@ def export(dive: Dive, output: Path, what: str | None = None) -> int:
             if envelope.topic.name in SERIES:
                 for name, values in _series(msgspec.to_builtins(envelope.message)):
                     recording.log(f"{entity}/{name}", rerun.Scalars(values))
-            drawing.take(envelope.message, is_track=envelope.topic.name == track)
+            if envelope.topic is NET_POSE and isinstance(envelope.message, NodePose):
+                drawing.take_placed(envelope.message)
+            else:
+                drawing.take(envelope.message, is_track=envelope.topic.name == track)
             count += 1
         recording.disconnect()
     return count
@@ -74,10 +79,15 @@ def _is_number(value: Any) -> bool:
 
 
 class _Drawing:
-    """What is drawn: world is east, north, up; A's camera is in it, B's camera in A's, by the track or by poses."""
+    """What is drawn: world is east, north, up; A's camera is in it, B's camera in A's, by the track or by poses.
+
+    Nodes of a net are in the net's frame, and nothing else places them.
+    """
 
     def __init__(self, rerun: Any, recording: Any, dive: Dive, track: str | None) -> None:
         self._rr, self._log, self._track = rerun, recording.log, track
+        self._nets = nets_of(dive)
+        self._depths = NetDepths()
         self._camera = BaseCamera()
         self._camera.base = base_of(dive)
         self._camera.infos.update(dive.infos())
@@ -94,7 +104,7 @@ class _Drawing:
             self._camera.take(message)
         elif isinstance(message, Attitude):
             R = self._camera.orientation(message)
-            if R is not None:
+            if R is not None and message.node not in self._nets:
                 at_m = self._camera.position_m(message.node)
                 self._log(self._eye(message.node), rr.Transform3D(translation=at_m, mat3x3=R))
         elif isinstance(message, CompressedImage):
@@ -112,10 +122,25 @@ class _Drawing:
             self._log(f"log/{name.replace(' ', '/')}", rr.TextLog(text))
 
     def _eye(self, node: str) -> str:
-        """Return a camera's entity: A's in the world, the others in A's."""
+        """Return a camera's entity: in its net; without one A's in the world, the others in A's."""
+        if node in self._nets:
+            return f"world/net_{self._nets[node]}/{node}"
         return f"world/{node}" if node == self._base else f"world/{self._base}/{node}"
 
+    def take_placed(self, pose: NodePose) -> None:
+        """Draw a node in its net, and how deep the net is."""
+        rr, net = self._rr, f"world/net_{pose.net}"
+        at_m, R = net_enu(pose)
+        self._log(self._eye(pose.node), rr.Transform3D(translation=at_m, mat3x3=R))
+        self._log(f"{net}/trail_{pose.node}", rr.Points3D([at_m], colors=_rgb(OTHER), radii=0.02))
+        up_m = self._depths.up_m(pose, self._camera)
+        if up_m is not None:
+            self._log(net, rr.Transform3D(translation=(0.0, 0.0, up_m)))
+
     def _place(self, estimate: Track | RelativePose) -> None:
+        # An entity has one place in the tree: of other pairs than A's nothing is drawn.
+        if estimate.node_a != self._base or estimate.node_b in self._nets:
+            return
         rr = self._rr
         turn = rr.Quaternion(xyzw=estimate.q_a_b_xyzw)
         self._log(self._eye(estimate.node_b), rr.Transform3D(translation=estimate.t_a_b_m, quaternion=turn))

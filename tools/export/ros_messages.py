@@ -30,7 +30,7 @@ from buddyline.protocol.messages import (
 )
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
 from buddyline.tools.estimate import range_sigma_m
-from buddyline.tools.export.enu import R_ENU_NED, SILENT_NS, BaseCamera, FrameTree
+from buddyline.tools.export.enu import R_ENU_NED, SILENT_NS, BaseCamera, FrameTree, NetDepths, net_enu
 from buddyline.tools.extras import needed
 from buddyline.tools.health.words import reason_words
 
@@ -83,8 +83,7 @@ class Translation:
         self._tracked_ns: dict[tuple[str, str], int] = {}
         self._tree = FrameTree()
         self._based_ns = 0
-        # The node whose depth says how deep a net's zero is, by net.
-        self._sounded: dict[str, str] = {}
+        self._depths = NetDepths()
 
     def messages(self, message: Message) -> Iterator[RosMessage]:
         """Yield the ROS messages for one of our messages; raise MessageError where ROS cannot say its time."""
@@ -264,21 +263,22 @@ class Translation:
         of its nodes says.
         """
         net, node = name_of(pose.net), name_of(pose.node)
-        R_net_camera = quat_to_matrix(np.array(pose.q_xyzw))
-        x, y, z = (R_ENU_NED @ np.array(pose.p_m)).tolist()
+        at_m, R_enu_camera = net_enu(pose)
+        x, y, z = at_m.tolist()
         turn = np.kron(np.eye(2), R_ENU_NED)
         covariance = (turn @ np.array(pose.covariance).reshape(6, 6) @ turn.T).ravel()
         frame = f"net_{pose.net}"
-        placed = self._posed(pose.stamp_ns, frame, (x, y, z), R_ENU_NED @ R_net_camera, covariance)
-        velocity_mps, unknown = R_net_camera.T @ np.array(pose.v_mps), UNKNOWN_VARIANCE * np.eye(3)
+        placed = self._posed(pose.stamp_ns, frame, (x, y, z), R_enu_camera, covariance)
+        velocity_mps = R_enu_camera.T @ R_ENU_NED @ np.array(pose.v_mps)
+        unknown = UNKNOWN_VARIANCE * np.eye(3)
         value = self._odometry(placed, f"{node}_camera", velocity_mps, unknown)
         yield RosMessage(f"/buddyline/net/{net}/{node}", ODOMETRY_TYPE, value)
         # No node's id has a slash.
         self._tree.place(f"net/{net}", pose.node, pose.stamp_ns, first=True)
-        yield self._transform(pose.stamp_ns, frame, f"{node}_camera", (x, y, z), R_ENU_NED @ R_net_camera)
-        above_m = float(self._camera.position_m(pose.node)[2])
-        if above_m and self._sounded.setdefault(net, pose.node) == pose.node:
-            yield self._transform(pose.stamp_ns, MAP, frame, (0.0, 0.0, above_m - z), np.eye(3))
+        yield self._transform(pose.stamp_ns, frame, f"{node}_camera", (x, y, z), R_enu_camera)
+        up_m = self._depths.up_m(pose, self._camera)
+        if up_m is not None:
+            yield self._transform(pose.stamp_ns, MAP, frame, (0.0, 0.0, up_m), np.eye(3))
 
     def _odometry(self, placed: Any, child: str, velocity_mps: Any, of_velocity: Any) -> Any:
         """Return the odometry of a child frame at a placed pose; its velocity and covariance are in that frame."""
