@@ -4,7 +4,7 @@ import math
 import re
 
 import pytest
-from buddyline.tools.draw.above import ASCII_ARROWS, from_above
+from buddyline.tools.draw.above import ASCII_ARROWS, from_above, nodes_from_above
 
 
 def place(lines, name):
@@ -46,3 +46,18 @@ def test_all_stays_on_the_page(size, right_m):
     assert all(character.isascii() for line in lines for character in line)
     assert any("A" in line for line in lines)
     assert any("B" in line for line in lines)
+
+
+def test_any_number_of_nodes_stands_with_north_up():
+    nodes = [
+        ("a", 0.0, 0.0, 0.0),
+        ("b", 8.0, 0.0, math.pi),
+        ("c", 0.0, 6.0, -math.pi / 2),
+        ("d", 8.0, 6.0, math.pi / 2),
+    ]
+    *page, scale = nodes_from_above(40, 10, nodes, arrows=ASCII_ARROWS)
+    assert (len(page), scale) == (9, "from above, north up; a row is 1 m")
+    assert page[0].split() == ["bv", "d>"]
+    assert page[8].split() == ["a^", "c<"]
+    assert page[8].index("c") - page[8].index("a") == 12
+    assert nodes_from_above(40, 4, nodes[:1])[:-1].count("") == 2

@@ -13,6 +13,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.topics import key_of
 from buddyline.tools.cli import main
 from buddyline.tools.demo.team_dashboard import TeamDashboard, team_summary_text
+from buddyline.tools.health.words import reason_words
 from msgspec.structs import replace
 
 from tests.tools.evaluated import pose, rejection
@@ -32,7 +33,7 @@ class WatchedTeam:
         self.dashboard = TeamDashboard(scenario, 10.0, lambda: self.now_s)
 
     def take(self, message):
-        self.dashboard.take(open_envelope(key_of(message), encode(message), at(0)))
+        self.dashboard.take(open_envelope(key_of(message), encode(message), message.stamp_ns))
 
     def tell(self, node, k, east_m=0.0, origin=None):
         true = self.world.node_truth(node, at(k), "main")
@@ -76,10 +77,52 @@ def test_the_summary_has_each_nodes_errors():
     assert {node: one["fixed"] for node, one in summary["network"].items()} == {"a": True, "b": False, "c": False}
     assert summary["network"]["b"]["position_error_m"] == pytest.approx(0.01)
     assert summary["network"]["c"]["wrong"] == 1
-    assert (summary["pairs"], summary["cpu_share"]) == ({"a/b": {"poses": 1, "triggers": 1}}, {"solver": 0.5})
+    assert summary["cpu_share"] == {"solver": 0.5}
     text = team_summary_text(summary)
     assert "a (fixed)" in text
     assert "solver 50%" in text
+    assert "compasses" not in text
+    assert summary["network"]["b"]["stated_position_sigma_m"] == pytest.approx(0.03**0.5 / 10)
+
+
+def test_the_summary_says_which_pairs_had_poses_and_why_others_had_none():
+    watch = WatchedTeam(Scenario(**(asdict(SCENARIO) | {"fixed_nodes": ()})))
+    watch.tell("a", 0, origin="a")
+    watch.tell("b", 0, origin="a")
+    first = START_NS // 100_000_000
+    for k in range(10):
+        outcome = replace(pose(k) if k < 8 else rejection(k), trigger=first + k)
+        watch.take(outcome)
+        watch.take(replace(rejection(k), node_a="a", node_b="c", trigger=first + k, reason="too_few_candidates"))
+    summary = watch.dashboard.summary({})
+    assert summary["pairs"]["a/b"]["triggers_in_view"] >= 8
+    text = team_summary_text(summary)
+    assert "a/b 8 of 10 (80%; " in text
+    assert "a/c 0 of 10 (0%; never in view)" in text
+    assert f"without a pose: {reason_words('too_few_candidates')} 83%, {reason_words('ambiguous')} 17%" in text
+    assert re.search(r"^c +0 +- ", text, re.MULTILINE), "a node that was never told is told"
+    assert "compasses" in text
+    assert "--rate" not in text
+
+
+def test_a_machine_that_does_not_keep_up_is_said():
+    watch = WatchedTeam()
+    first = START_NS // 100_000_000
+    for k in range(0, 40, 4):
+        watch.take(replace(pose(k), trigger=first + k))
+    assert "too slow for the demo; --rate 4 takes fewer" in team_summary_text(watch.dashboard.summary({}))
+
+
+def test_the_screen_shows_all_nodes_from_above():
+    watch = WatchedTeam()
+    for node in "abc":
+        watch.tell(node, 0)
+    screen = watch.dashboard.screen(80, 40)
+    assert "from above, north up" in screen
+    assert len(screen.splitlines()) <= 40
+    above = screen.partition("from above")[0]
+    for node in "abc":
+        assert re.search(rf"{node}[↑↗→↘↓↙←↖]", above)
 
 
 def test_without_a_fixed_node_places_count_from_the_origin():

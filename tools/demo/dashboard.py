@@ -332,7 +332,7 @@ def overwritten(lines: Iterable[str]) -> str:
 
 def summary_text(summary: dict[str, Any]) -> str:
     """Return the figures of a whole run for a person."""
-    slow = _slow_words(summary["pictured_share"])
+    slow = slow_words(summary["pictured_share"])
     if not summary["poses"]:
         return "\n".join(
             [f"no pose in {summary['seconds']:.0f} s; rejected: {summary['rejected'] or 'nothing'}", *slow]
@@ -356,7 +356,7 @@ def summary_text(summary: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _slow_words(share: float | None) -> list[str]:
+def slow_words(share: float | None) -> list[str]:
     """Return a line where too few triggers had both pictures."""
     if share is None or share >= ENOUGH_PICTURES:
         return []

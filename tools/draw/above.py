@@ -1,8 +1,9 @@
-"""Two divers from above, as text: where they are, and where each looks."""
+"""Divers from above, as text: where they are, and where each looks."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final
 
 # Looking forward (up on the page), and on clockwise by 45 degrees.
@@ -45,7 +46,28 @@ def from_above(
     return ["".join(line).rstrip() for line in page] + [f"from above; a row is {row_m:g} m"]
 
 
+def nodes_from_above(
+    width: int, height: int, nodes: Sequence[tuple[str, float, float, float]], *, arrows: str = ARROWS
+) -> list[str]:
+    """Draw nodes with north up; return height lines of width characters at most, the last with the scale.
+
+    nodes: each one's name, of one character, north and east in m, and the azimuth in rad in which it looks.
+    """
+    rows = max(height - 1, 2)
+    norths_m, easts_m = [node[1] for node in nodes], [node[2] for node in nodes]
+    least_north_m, most_north_m, least_east_m, most_east_m = min(norths_m), max(norths_m), min(easts_m), max(easts_m)
+    row_m = _row_m(rows, width // 2, (most_east_m - least_east_m) / 2, most_north_m - least_north_m)
+    page = [[" "] * width for _ in range(rows)]
+    for name, north_m, east_m, look_rad in nodes:
+        above = (north_m - (least_north_m + most_north_m) / 2) / row_m
+        right = (east_m - (least_east_m + most_east_m) / 2) / row_m * COLUMNS_A_ROW
+        row = min(max(round((rows - 1) / 2 - above), 0), rows - 1)
+        column = min(max(round(width / 2 - 1 + right), 0), width - 2)
+        page[row][column : column + 2] = [name, arrows[round(look_rad / (math.pi / 4)) % 8]]
+    return ["".join(line).rstrip() for line in page] + [f"from above, north up; a row is {row_m:g} m"]
+
+
 def _row_m(rows: int, middle: int, right_m: float, forward_m: float) -> float:
-    """Return the least round length of a row with which both divers are on the page."""
+    """Return the least round length of a row with which both ends are on the page."""
     needed_m = max(forward_m / max(rows - 1, 1), right_m * COLUMNS_A_ROW / max(middle - 2, 1))
     return next((step_m for step_m in STEPS_M if step_m >= needed_m), STEPS_M[-1])
