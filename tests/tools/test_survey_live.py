@@ -10,6 +10,7 @@ from buddyline.tools.survey.readings import of_messages
 from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
 from msgspec.structs import replace
 
+from tests.tools import evaluated, watched
 from tests.tools import survey_world as world
 
 
@@ -120,3 +121,20 @@ def test_in_a_team_of_three_each_verdict_names_its_pair():
     said = [mark for message in team for mark in live.handle(message)]
     told = {node: {mark.note.partition(": ")[0] for mark in said if mark.node == node} for node in "abc"}
     assert told == {"a": {"a/b", "a/c"}, "b": {"a/b"}, "c": {"a/c"}}
+
+
+@pytest.mark.parametrize("lost", [lambda k: k % 4 == 0, lambda k: k % 50 < 20], ids=["each fourth", "for two seconds"])
+def test_nodes_that_swim_while_some_poses_are_refused_do_not_rest(lost):
+    """B swims past a with 0.5 m/s for 24 s; of the first half some poses are refused, one by one or for seconds."""
+    live, said = LiveLegs(SurveySettings(), AlarmSettings()), []
+    for node in "ab":
+        live.handle(evaluated.info(node))
+    for k in range(240):
+        for node in "ab":
+            said += live.handle(watched.attitude(node, watched.at(k)))
+            said += live.handle(watched.depth(node, watched.at(k)))
+        x_m = -6.0 + 0.05 * k
+        refused = replace(evaluated.rejection(k), reason="ambiguous")
+        found = evaluated.pose(k, (x_m, 0.0, 4.0), range_m=float(np.hypot(x_m, 4.0)))
+        said += live.handle(refused if k < 120 and lost(k) else found)
+    assert [mark.note for mark in said] == []

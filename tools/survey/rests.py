@@ -19,6 +19,8 @@ WANDER_RADPS: Final = 0.006
 WANDER_SHARE_HZ: Final = 0.23
 # A longer gap between fixes ends a rest, unless the line between the nodes is still the same.
 PAUSE_NS: Final = 5_000_000_000
+# Poses so near to a stretch of refused ones tell whether the nodes moved during it.
+BESIDE_NS: Final = 1_000_000_000
 # Two lines are the same if they differ by less than this length plus this share of the range.
 SAME_M: Final = 0.25
 SAME_SHARE: Final = 0.06
@@ -53,7 +55,8 @@ def rests(readings: PairReadings, seen: Sights, settings: SurveySettings) -> lis
     handled_by = [handled(node, seen.stamps_ns, settings) for node in readings.pair]
     yaw_rad = np.nan_to_num(seen.sigma_rad[:, :, 2].max(axis=0))
     wander_mps = np.maximum(WANDER_RADPS, WANDER_SHARE_HZ * yaw_rad) * seen.range_m
-    still = (speeds_mps(seen) < settings.rest_speed_mps + wander_mps) & ~np.any(handled_by, axis=0)
+    limit_mps = settings.rest_speed_mps + wander_mps
+    still = (speeds_mps(seen) < limit_mps) & ~np.any(handled_by, axis=0)
     found: list[Rest] = []
     for run in _merged(_runs(seen, still), seen):
         start_ns, end_ns = int(seen.stamps_ns[run[0]]), int(seen.stamps_ns[run[-1]])
@@ -69,7 +72,9 @@ def rests(readings: PairReadings, seen: Sights, settings: SurveySettings) -> lis
             if start_ns <= one.stamp_ns <= end_ns:
                 unused.setdefault(one.reason, []).append(one.trigger)
         found.append(Rest(chosen, start_ns, end_ns, _line_m(seen, run), too_short, unused))
-    return sorted([*found, *_refused(readings, seen, still, found, settings)], key=lambda one: one.start_ns)
+    lost = _refused(readings, seen, still, found, settings)
+    lost = [one for one in lost if not _moved(seen, one.start_ns, one.end_ns, limit_mps)]
+    return sorted([*found, *lost], key=lambda one: one.start_ns)
 
 
 def _long_enough(count: int, span_ns: int, settings: SurveySettings, share: float = 1.0) -> bool:
@@ -79,21 +84,28 @@ def _long_enough(count: int, span_ns: int, settings: SurveySettings, share: floa
 def _refused(
     readings: PairReadings, seen: Sights, still: Bools, found: list[Rest], settings: SurveySettings
 ) -> list[Rest]:
-    """Return stretches outside the found rests in which both nodes saw lights but hardly any pose was found."""
+    """Return stretches outside the found rests in which both nodes saw lights but hardly any pose was found.
+
+    Poses that show the nodes moving, LEAST_RUN of them in a row, end a stretch. It is as long as a leg's rest: lights
+    that are refused show of no shorter time whether the nodes stood still.
+    """
+    moving_ns = seen.stamps_ns[~still]
     events = [(int(seen.stamps_ns[i]), "fix") for i in np.flatnonzero(still).tolist()]
     events += [(one.stamp_ns, one.reason) for one in readings.rejected if one.reason not in UNSEEN]
     groups: list[list[tuple[int, str]]] = []
     for event in sorted(events):
         if any(one.start_ns - PAUSE_NS <= event[0] <= one.end_ns + PAUSE_NS for one in found):
             continue
-        if groups and event[0] - groups[-1][-1][0] < PAUSE_NS:
+        last_ns = groups[-1][-1][0] if groups else event[0] - PAUSE_NS
+        moving = np.searchsorted(moving_ns, event[0]) - np.searchsorted(moving_ns, last_ns)
+        if event[0] - last_ns < PAUSE_NS and moving < LEAST_RUN:
             groups[-1].append(event)
         else:
             groups.append([event])
     lost = []
     for group in groups:
         start_ns, end_ns = group[0][0], group[-1][0]
-        if not _long_enough(len(group), end_ns - start_ns, settings, 0.5):
+        if not _long_enough(len(group), end_ns - start_ns, settings):
             continue
         reasons = Counter(reason for _, reason in group)
         text = f"{(end_ns - start_ns) / 1e9:.0f} s with {reasons.pop('fix', 0)} fixes"
@@ -101,6 +113,22 @@ def _refused(
             text += "; refused: " + ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
         lost.append(Rest(np.zeros(len(still), dtype=bool), start_ns, end_ns, np.zeros(3), text))
     return lost
+
+
+def _moved(seen: Sights, start_ns: int, end_ns: int, limit_mps: Floats) -> bool:
+    """Return whether the line between the nodes is elsewhere after a stretch than before it: they moved meanwhile.
+
+    limit_mps (n,): the speed of each fix below which the pair counts as resting.
+    """
+    first, end = np.searchsorted(seen.stamps_ns, (start_ns, end_ns + 1)).tolist()
+    before = [i for i in range(max(first - LEAST_RUN, 0), first) if seen.stamps_ns[i] > start_ns - BESIDE_NS]
+    last = min(end + LEAST_RUN, len(limit_mps))
+    after = [i for i in range(end, last) if seen.stamps_ns[i] < end_ns + BESIDE_NS]
+    if not before or not after:
+        return False
+    apart_s = float(seen.stamps_ns[after].mean() - seen.stamps_ns[before].mean()) / S_NS
+    moved_m = float(np.linalg.norm(_line_m(seen, after) - _line_m(seen, before)))
+    return moved_m / apart_s > float(max(limit_mps[before[-1]], limit_mps[after[0]]))
 
 
 def same_line(one_m: Floats, other_m: Floats) -> bool:
