@@ -219,6 +219,12 @@ class FixedConfig(Config, frozen=True, kw_only=True):
         )
 
 
+class PlaceConfig(Config, frozen=True, kw_only=True):
+    """A file of a node's place alone, as `buddyline net init` writes it."""
+
+    fixed: FixedConfig
+
+
 class PowerConfig(Config, frozen=True, kw_only=True):
     """[power]: the battery gauge on sensors.i2c_bus, and what is left out when the node gets hot.
 

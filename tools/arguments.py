@@ -166,6 +166,13 @@ def solve(parser: argparse.ArgumentParser) -> None:
         metavar="NODE=FILE",
         help="a calibration instead of the log's: JSON or log",
     )
+    parser.add_argument(
+        "--place",
+        action="append",
+        default=[],
+        metavar="NODE=FILE.toml",
+        help="where a node stood still, as `buddyline net init` writes it, instead of the log's; repeatable",
+    )
     clocks = parser.add_mutually_exclusive_group()
     clocks.add_argument(
         "--clock-offset",

@@ -24,6 +24,8 @@ log = logging.getLogger(__name__)
 # A node whose place scatters by more than this, RMS, does not stand still.
 STILL_M: Final = 0.05
 STILL_RAD: Final = 0.03
+# The same of the origin's tilt, of which its own attitudes alone tell: they err by a degree and a half.
+STILL_TILT_RAD: Final = 0.06
 # Errors of the network's poses are correlated over about a second.
 INDEPENDENT_S: Final = 1.0
 RATE_HZ: Final = 10.0
@@ -89,6 +91,8 @@ def find(paths: Sequence[str], still: Sequence[str], net: str) -> dict[str, Stan
     from msgspec.structs import replace
 
     origin = still[0]
+    if len(set(still)) < len(still):
+        raise BuddylineError(f"--still: a node is named twice: {', '.join(still)}")
     with Dive(paths) as dive:
         infos = dive.infos()
         for node in still:
@@ -102,6 +106,7 @@ def find(paths: Sequence[str], still: Sequence[str], net: str) -> dict[str, Stan
                 depths.append(envelope.message.depth_m)
         if not attitudes:
             raise BuddylineError(f"{dive.name}: no attitude of node {origin}: its compass must say where north is")
+        _check_still(origin, np.array(attitudes))
         R_body_camera = quat_to_matrix(np.array(infos[origin].q_body_camera_xyzw))
         R = _mean_rotation(np.array(attitudes)) @ R_body_camera
         port_m = float((R @ np.array(infos[origin].depth_port_m))[2])
@@ -130,6 +135,30 @@ def find(paths: Sequence[str], still: Sequence[str], net: str) -> dict[str, Stan
     for node in still[1:]:
         stands[node] = _stand(node, found[node], net)
     return stands
+
+
+def load_place(path: str) -> FixedPlace:
+    """Read the lines that `net init` wrote; raise ConfigError naming file, field and value."""
+    from buddyline.node.config import PlaceConfig
+    from buddyline.protocol.config import ConfigError, load_config
+
+    try:
+        return load_config(path, PlaceConfig).fixed.place
+    except ValueError as error:
+        raise ConfigError(f"{path}: fixed.{error}") from error
+
+
+def _check_still(node: str, R_ned_body: NDArray[np.float64]) -> None:
+    """Raise BuddylineError where a node's own attitudes (N, 3, 3) say that it did not stand still."""
+    import numpy as np
+
+    down = R_ned_body[:, 2]
+    # The mean of unit vectors is shorter than one by half of their mean square angle from it.
+    tilt_rad = math.sqrt(max(2.0 * (1.0 - float(np.linalg.norm(down.mean(axis=0)))), 0.0))
+    if tilt_rad > STILL_TILT_RAD:
+        raise BuddylineError(
+            f"node {node}: does not stand still: its tilt scatters by {math.degrees(tilt_rad):.1f} deg"
+        )
 
 
 def _stand(node: str, poses: Sequence[NodePose], net: str) -> Stand:

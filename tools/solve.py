@@ -26,6 +26,7 @@ from buddyline.solver_service.pair_core import PairCore
 from buddyline.tools.authenticity import AUTHENTICITY, check_logs
 from buddyline.tools.clock_curves import chosen_curves
 from buddyline.tools.dives import Dive, load_info
+from buddyline.tools.net import load_place
 from buddyline.tools.newfile import new_dive_log
 from buddyline.tools.option_values import node_files
 from msgspec import UNSET
@@ -48,6 +49,7 @@ def run(args: argparse.Namespace) -> int:
     )
     replaced = replacements(args.info)
     with Dive(args.dives) as dive:
+        replaced |= placed(args.place, dive.infos() | replaced)
         nodes, infos = nodes_of(dive, args.nodes), dive.infos() | replaced
         nodes = _with_info(dive, nodes, infos, given=args.nodes is not None)
         if len(nodes) > 2 and (args.clock_offset is not None or args.clocks is not None):
@@ -125,6 +127,18 @@ def replacements(given: list[str]) -> dict[str, NodeInfo]:
             raise ConfigError(f"--info {node}={path}: the file describes node {info.node}")
         replaced[node] = info
     return replaced
+
+
+def placed(given: list[str], infos: Mapping[str, NodeInfo]) -> dict[str, NodeInfo]:
+    """Return the calibrations of the nodes of `--place NODE=FILE`, with their places."""
+    found: dict[str, NodeInfo] = {}
+    for node, path in node_files("--place", given):
+        if node not in infos:
+            raise ConfigError(f"--place {node}={path}: no NodeInfo of node {node}; nodes: {', '.join(sorted(infos))}")
+        if node in found:
+            raise ConfigError(f"--place {node}={path}: node {node} has a place already")
+        found[node] = replace(infos[node], fixed=load_place(path))
+    return found
 
 
 def nodes_of(dive: Dive, given: list[str] | None) -> list[str]:

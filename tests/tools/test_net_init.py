@@ -39,6 +39,14 @@ def test_the_places_are_found_through_a_third_node(dive, tmp_path):
     assert np.linalg.norm(rotation_log(R @ R_true.T)) < 0.01
     assert found["a"]["p_m"][:2] == [0.0, 0.0]
     assert found["a"]["p_m"][2] == pytest.approx(true["a"].p_m[2], abs=0.02)
+    # The same dive is solved with it: places count from a, and b is where it is in truth.
+    solved = tmp_path / "solved.mcap"
+    words = [word for node in "ac" for word in ("--place", f"{node}={tmp_path / 'places' / node}.toml")]
+    assert main(["solve", str(path), "-o", str(solved), "--track", "filter", "--track-hz", "5", *words]) == 0
+    with DiveLogReader(solved) as reader:
+        rows = [record.open().message for record in reader.records(lambda key: key.startswith("buddyline/net/main/c"))]
+    assert rows
+    assert np.linalg.norm(np.array(rows[-1].p_m) - found["c"]["p_m"]) < 0.02
     # The lines are a node's configuration.
     config = tmp_path / "c.toml"
     config.write_text('node = "c"\n' + texts["c"])
@@ -61,3 +69,38 @@ def test_one_node_alone_is_the_origin(dive, capsys):
     place = json.loads(capsys.readouterr().out)["c"]
     assert place["p_m"][:2] == [0.0, 0.0]
     assert place["sigma_m"] > 0.0 < place["sigma_rad"]
+
+
+def test_an_origin_that_swims_is_no_origin(dive, capsys):
+    assert main(["net", "init", str(dive[0]), "--still", "b"]) == 2
+    assert "node b: does not stand still: its tilt scatters by" in capsys.readouterr().err
+
+
+def test_a_node_named_twice_is_said(dive, capsys):
+    assert main(["net", "init", str(dive[0]), "--still", "a", "--still", "a"]) == 2
+    assert "named twice: a, a" in capsys.readouterr().err
+
+
+PLACE = "[fixed]\np_m = [0.0, 0.0, 5.0]\nq_xyzw = [0.5, 0.5, 0.5, 0.5]\n"
+
+
+@pytest.mark.parametrize(
+    ("nodes", "text", "says"),
+    [
+        ("z", PLACE, "no NodeInfo of node z; nodes: a, b, c"),
+        ("aa", PLACE, "node a has a place already"),
+        ("a", PLACE.replace("0.5, 0.5]", "0.5, 0.9]"), "fixed.q_xyzw"),
+        ("a", PLACE + "colour = 1\n", "colour"),
+        ("a", "net = 'main'\n", "net"),
+        ("a", PLACE + PLACE, "not TOML"),
+    ],
+)
+def test_a_wrong_place_is_named(dive, tmp_path, capsys, nodes, text, says):
+    file, out = tmp_path / "place.toml", tmp_path / "out.mcap"
+    file.write_text(text)
+    words = [word for node in nodes for word in ("--place", f"{node}={file}")]
+    assert main(["solve", str(dive[0]), "-o", str(out), *words]) == 2
+    said = capsys.readouterr().err
+    assert says in said
+    assert "place.toml" in said
+    assert not out.exists()
