@@ -107,6 +107,11 @@ class Subscription(Protocol):
         """Number of messages that were lost on the way (of topics that keep more than the latest message)."""
         ...
 
+    @property
+    def waiting(self) -> int:
+        """Number of messages that have come, and that the handler has not been given yet."""
+        ...
+
     def close(self) -> None:
         """Let the handler finish the queued messages, for one second at most, and end its thread."""
         ...

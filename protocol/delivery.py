@@ -73,13 +73,15 @@ class Delivery(Generic[T]):
     Queues take turns: a sender of more than can be handled delays and loses what is in its own queue. Items of a queue
     come in order, and so do those of an owner: while its last item may wait in another queue, the next waits there too.
     The queue "" comes before all others, and one that is last after them. Of a queue that is full (`capacity` items)
-    the oldest item is dropped; of all together beyond MAX_QUEUED_BYTES, that of the largest. `dropped` counts them.
+    the oldest item is dropped; of all together beyond MAX_QUEUED_BYTES, that of the largest. `dropped` counts them;
+    `waiting` those that the handler will get.
     """
 
     def __init__(self, name: str, handle: Callable[[T], None], capacity: int, failures: FailureLatch) -> None:
         if capacity < 1:
             raise ValueError(f"capacity {capacity}: at least 1")
         self.dropped = 0
+        self.waiting = 0
         self._handle = handle
         self._capacity = capacity
         self._failures = failures
@@ -105,6 +107,7 @@ class Delivery(Generic[T]):
             into.bytes += size_bytes
             into.is_last = is_last
             self._bytes += size_bytes
+            self.waiting += 1
             if len(into.items) > self._capacity:
                 self._take(queue)
                 self.dropped += 1
@@ -127,7 +130,7 @@ class Delivery(Generic[T]):
         self._thread.join(timeout_s)
         if self._thread.is_alive():
             with self._changed:
-                self._queues.clear()
+                self._clear()
             log.warning("thread %r is still busy after %g s", self._thread.name, timeout_s)
 
     def _run(self) -> None:
@@ -143,8 +146,12 @@ class Delivery(Generic[T]):
         except Exception as error:
             with self._changed:
                 self._closing = True
-                self._queues.clear()
+                self._clear()
             self._failures.report(self._thread.name, error)
+
+    def _clear(self) -> None:
+        self._queues.clear()
+        self.waiting = 0
 
     def _next(self) -> T:
         """Take an item of the queue whose turn it is."""
@@ -169,6 +176,7 @@ class Delivery(Generic[T]):
         item, size_bytes = queue.items.popleft()
         queue.bytes -= size_bytes
         self._bytes -= size_bytes
+        self.waiting -= 1
         if not queue.items:
             del self._queues[name]
         return item

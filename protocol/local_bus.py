@@ -124,6 +124,11 @@ class LocalSubscription:
         """Number of messages dropped because the handler was too slow."""
         return self._delivery.dropped
 
+    @property
+    def waiting(self) -> int:
+        """Number of messages that wait for the handler."""
+        return self._delivery.waiting
+
     def takes(self, key: str) -> bool:
         """Return whether the subscription matches key."""
         return any(key_matches(key_expr, key) for key_expr in self._key_exprs)
@@ -160,6 +165,11 @@ class LocalWatch:
     def dropped(self) -> int:
         """Number of changes dropped because the handler was too slow."""
         return self._delivery.dropped
+
+    @property
+    def waiting(self) -> int:
+        """Number of changes that wait for the handler."""
+        return self._delivery.waiting
 
     def offer(self, name: str, alive: bool) -> None:
         """Queue one change."""

@@ -51,11 +51,12 @@ class SolverCore:
     """Solves each trigger of each pair once.
 
     chosen: the pairs to solve; None for every pair of nodes that appear, A before B in the alphabet. clocks: each
-    node's clock minus the common clock, where known; the node's stamps are moved to the common clock. align:
-    estimate the clock offset of each pair. track: the tracks to make; None for no track, and no network. lone: nodes of
-    the network beside those of the chosen pairs. network: follows all nodes in one frame; None without `track`. unused:
-    number of messages of each node that is not used. shared: other cores have some of the pairs, and perhaps the
-    network: this one begins with none, and gets its own by `adopt` and `adopt_network`.
+    node's clock minus the common clock, where known; the node's stamps are moved to the common clock. align: estimate
+    the clock offset of each pair. track: the tracks to make; None for no track, and no network. lone: nodes of the
+    network beside those of the chosen pairs. network: follows all nodes in one frame; None without `track`. unused:
+    number of messages of each node that is not used. hurried: of many pairs, solve one in five triggers. shared: other
+    cores have some of the pairs, and perhaps the network: this one begins with none, and gets its own by `adopt` and
+    `adopt_network`.
     """
 
     def __init__(
@@ -74,6 +75,7 @@ class SolverCore:
         self.pairs: dict[PairId, PairCore] = {}
         self.health = Health()
         self.unused: Counter[str] = Counter()
+        self.hurried = False
         self._chosen = chosen
         self._clocks = clocks or {}
         self._align = align
@@ -226,7 +228,7 @@ class SolverCore:
     def _settled(self, pairs: Iterable[PairCore], told_ns: int = -1) -> list[Message]:
         messages: list[Message] = []
         for pair in pairs:
-            pair.crowd(len(self.streams))
+            pair.crowd(len(self.streams), hurried=self.hurried)
             messages += pair.settle(told_ns)
         if self.network is None:
             return messages

@@ -24,7 +24,7 @@ from buddyline.solver_service.geometry.trigger import TriggerReadings, read_trig
 from buddyline.solver_service.headings import HeadingOffset
 from buddyline.solver_service.prior import PosePrior
 from buddyline.solver_service.rarity import Rarity
-from buddyline.solver_service.resting import LOOK_APART, LOOKS, NOT_IN_VIEW, Resting, look_apart
+from buddyline.solver_service.resting import LOOK_APART, LOOKS, NO_TIME, NOT_IN_VIEW, Resting, look_apart
 from buddyline.solver_service.results import NUMERIC_ERRORS, view_of
 from msgspec import UNSET
 
@@ -84,12 +84,14 @@ class PairSolver:
     """Solves the triggers of one pair.
 
     alignment: gets each fix, to estimate the clock offset; None for none. crowded: whether there are many other pairs.
+    hurried: whether only one in LOOKS triggers is to be solved, of a pair that rests one in LOOKS^2, because the solver
+    of these pairs cannot keep up.
     """
 
     def __init__(self, settings: Settings, alignment: ClockAlignment | None = None) -> None:
         self.settings = settings
         self.alignment = alignment
-        self.crowded = False
+        self.crowded = self.hurried = False
         self._prior = PosePrior()
         self._headings = HeadingOffset()
         self._rarity = Rarity()
@@ -121,8 +123,7 @@ class PairSolver:
 
     def _solve_batch(self, batch: Sequence[Matched]) -> list[Fix | NoFix]:
         # What is read does not depend on which triggers are read with it.
-        why = {id(one): detail for one in batch if (detail := self._may_rest(one))}
-        wanted = [one for one in batch if id(one) not in why or not self._resting.rests(one.stamp_ns)]
+        wanted = [one for one in batch if self._left_out(one) is None]
         try:
             readings = self._read(wanted) if wanted else None
         except NUMERIC_ERRORS as error:
@@ -133,13 +134,23 @@ class PairSolver:
         places = {id(one): place for place, one in enumerate(wanted)}
         found: list[Fix | NoFix] = []
         for one in batch:
-            if id(one) in why and self._resting.rests(one.stamp_ns):
-                found.append(NoFix("too_few_candidates", why[id(one)]))
+            if (left_out := self._left_out(one)) is not None:
+                found.append(left_out)
             elif id(one) in places and readings is not None:
                 found.append(self._decide(one, readings, places[id(one)]))
             else:
                 found.append(self._look(one))
         return found
+
+    def _left_out(self, one: Matched) -> NoFix | None:
+        """Return the outcome of a trigger that is not solved, as long as no trigger before it has woken the pair."""
+        may_rest = self._may_rest(one)
+        rests = bool(may_rest or self.hurried) and self._resting.rests(one.stamp_ns)
+        if may_rest and rests:
+            return NoFix("too_few_candidates", may_rest)
+        if self.hurried and one.trigger % (LOOKS * LOOKS if rests else LOOKS):
+            return NoFix("overload", NO_TIME)
+        return None
 
     def _may_rest(self, one: Matched) -> str:
         """Return why a trigger need not be solved where the pair rests, "" where it is solved in any case."""

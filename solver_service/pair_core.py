@@ -81,10 +81,10 @@ class PairCore:
         self._settled: list[Message] = []
         self._advised: list[str] = []
 
-    def crowd(self, nodes: int) -> None:
-        """Note how many nodes there are: this pair may be the only one, or one of many."""
+    def crowd(self, nodes: int, *, hurried: bool) -> None:
+        """Note how many nodes there are, for this pair may be one of many; hurried: whether the solver is behind."""
         self._alone, crowded = nodes == 2, nodes >= CROWD
-        self.solver.crowded = crowded
+        self.solver.crowded, self.solver.hurried = crowded, crowded and hurried
         if self.tracker is not None:
             self.tracker.crowded = crowded
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import msgspec
-from buddyline.protocol.clock import Clock, SystemClock
+from buddyline.protocol.clock import S_NS, Clock, SystemClock
 from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import Candidates, Message, Rejected
@@ -40,7 +40,7 @@ from buddyline.solver_service.pair_core import PUBLISHED, PUBLISHED_FOR_NODES, P
 from buddyline.solver_service.shared_work import CLAIM_S, SharedWork
 
 if TYPE_CHECKING:
-    from buddyline.protocol.bus import Bus, Publisher, Received
+    from buddyline.protocol.bus import Bus, Publisher, Received, Subscription
 
 log = logging.getLogger(__name__)
 
@@ -53,6 +53,11 @@ STATUS_S: Final = 1.0
 WORDS_S: Final = 0.5
 MAX_ALIVE_NAME: Final = 64
 WAIT_S: Final = 1.0
+# Messages that wait are solved together, which costs half: so many, gathered for so long.
+TOGETHER: Final = 256
+GATHER_S: Final = 0.05
+# Frames of now that have waited for so long show that the solver cannot keep up; in a crowd it then solves less.
+BEHIND_NS: Final = 1 * S_NS
 # Within this time the nodes have connected again, sent what was missed, and the solver has waited for all.
 OWED_S: Final = 10.0
 
@@ -83,6 +88,12 @@ class SolverService(Service):
         )
         self._lock = threading.Lock()
         self._bus: Bus | None = None
+        self._subscription: Subscription | None = None
+        # Messages that are solved together with those that wait behind them, with their receive times.
+        self._came: list[tuple[Message, int]] = []
+        self._gather_until_s = 0.0
+        # How long the newest frame had waited in this process for its turn.
+        self._behind_ns = 0
         self._publishers: dict[str, Publisher] = {}
         self._declared: set[PairId] = set()
         self._refused = ""
@@ -160,6 +171,9 @@ class SolverService(Service):
         if self._work is not None and self._bus is not None:
             self._share(self._work, self._bus)
         with self._turn():
+            self._take_all()
+            if not self._more_waits:
+                self._behind_ns, self.core.hurried = 0, False
             results = self.core.advance(self.clock.now_ns())
             self._declare()
             self._publish(results)
@@ -243,7 +257,7 @@ class SolverService(Service):
         self._repeat(past.recent)
         # One subscription for all topics, so that cached messages come in the order of their stamps. A frame would
         # not wait for an attitude that comes a minute later.
-        bus.subscribe(
+        self._subscription = bus.subscribe(
             tuple(topic.key_any() for topic in (*SOLVED_FROM, IMU_MEANS)),
             self.receive,
             capacity=32768,
@@ -266,22 +280,24 @@ class SolverService(Service):
     def receive(self, received: Received) -> None:
         """Take one message from the bus; a bad one is counted and reported. At the end a backlog is left to the next.
 
-        The end would else wait for the lock, for as long as the backlog lasts.
+        The end would else wait for the lock, for as long as the backlog lasts. Where messages wait, a solver that
+        cannot keep up gathers them.
         """
         if self.stop.is_set():
             return
+        message: Message | None = None
         try:
             message = received.open().message
         except MessageError as error:
             self.refusals.note(received.key, error)
             self._refused = f"bad message on {received.key}: {error}"
-            return
         with self._lock:
-            if isinstance(message, Candidates):
-                self._take_frame(message, received.receive_ns)
-            else:
-                self._handle(message)
-            self._handled += 1
+            if message is not None:
+                if not self._came:
+                    self._gather_until_s = time.monotonic() + GATHER_S
+                self._came.append((message, received.receive_ns))
+            if not self._more_waits or len(self._came) >= TOGETHER or time.monotonic() > self._gather_until_s:
+                self._take_all()
 
     def watch(self, name: str, alive: bool) -> None:
         """Note that a node has started or ended; the next tick reports all of them at once."""
@@ -300,7 +316,8 @@ class SolverService(Service):
             refused, self._refused = self._refused, ""
             self._news = False
             flood = self._bus.flood_problem() if self._bus is not None else ""
-            problems = [one for one in (refused, flood) if one]
+            slow = f"the solver is {self._behind_ns / S_NS:.0f} s behind: too much for this machine"
+            problems = [one for one in (refused, flood, slow * (self._behind_ns > BEHIND_NS)) if one]
             problems += self._work.problems if self._work is not None else []
             statuses = self.core.report(now_ns, now_ns, self.refusals.count, problems)
             if not statuses:
@@ -312,19 +329,39 @@ class SolverService(Service):
             self.status_message = named[0][1] if named else statuses[0]
             self._publish(statuses)
 
-    def _take_frame(self, frame: Candidates, receive_ns: int) -> None:
-        """Handle a frame, unless it is from a cache and an earlier solver has answered it."""
-        new = self._joined_ns is not None and receive_ns > self._joined_ns
-        if new:
-            # All later frames are new too, even if the clock is set.
-            self._joined_ns = 0
-        elif self._answered.is_over(self.core.pairs_of(frame.node), frame.stamp_ns, self.clock.now_ns()):
-            self._come_again.discard((frame.node, frame.trigger))
-            return
-        self._handle(frame)
-        if new and self._is_of_now(frame):
-            pairs = self.core.pairs_of(frame.node)
-            self._publish(self._answered.saw_new_frame(pairs, frame.trigger, frame.stamp_ns))
+    @property
+    def _more_waits(self) -> bool:
+        return self._subscription is not None and self._subscription.waiting > 0
+
+    def _take_all(self) -> None:
+        """Handle what has come, except frames from a cache that an earlier solver has answered."""
+        came, self._came = self._came, []
+        together: list[Message] = []
+        for message, receive_ns in came:
+            if not isinstance(message, Candidates):
+                together.append(message)
+                continue
+            new = self._joined_ns is not None and receive_ns > self._joined_ns
+            # What a link or a cache has held for long says nothing of this solver's speed.
+            if abs(receive_ns - message.stamp_ns) < BEHIND_NS:
+                self._behind_ns = max(self.clock.now_ns() - receive_ns, 0)
+                self.core.hurried = self._behind_ns > BEHIND_NS
+            pairs = self.core.pairs_of(message.node)
+            if new:
+                # All later frames are new too, even if the clock is set.
+                self._joined_ns = 0
+            elif self._answered.is_over(pairs, message.stamp_ns, self.clock.now_ns()):
+                self._come_again.discard((message.node, message.trigger))
+                continue
+            together.append(message)
+            if new and self._is_of_now(message):
+                if not pairs:
+                    # It may be the node's first, by which its pairs form.
+                    self._handle(together)
+                    together, pairs = [], self.core.pairs_of(message.node)
+                self._publish(self._answered.saw_new_frame(pairs, message.trigger, message.stamp_ns))
+        self._handle(together)
+        self._handled += len(came)
 
     def _is_of_now(self, frame: Candidates) -> bool:
         """Return whether a new frame may be of another dive than what was answered before.
@@ -334,9 +371,11 @@ class SolverService(Service):
         in_this_dive = abs(self.clock.now_ns() - frame.stamp_ns) < THIS_DIVE_NS
         return self._player or not in_this_dive or frame.stamp_ns >= self._attached_ns
 
-    def _handle(self, message: Message) -> None:
+    def _handle(self, messages: list[Message]) -> None:
+        if not messages:
+            return
         # The time is now, not the receive time: a message that waited in the queue has not yet waited for other nodes.
-        results = self.core.handle(message, self.clock.now_ns())
+        results = self.core.handle_many(messages, self.clock.now_ns())
         self._declare()
         self._publish(results)
 

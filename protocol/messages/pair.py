@@ -31,6 +31,7 @@ Reason: TypeAlias = Literal[
     "duplicate",
     "heading",
     "other_lights",
+    "overload",
 ]
 TrackMode: TypeAlias = Literal["filter", "lag", "smooth"]
 

@@ -50,6 +50,11 @@ class ZenohWatch:
         """Number of changes dropped because the handler was too slow, or there were too many."""
         return self._delivery.dropped + sum(self.limit.dropped.values())
 
+    @property
+    def waiting(self) -> int:
+        """Number of changes that wait for the handler."""
+        return self._delivery.waiting
+
     def close(self) -> None:
         """End the threads."""
         self._narrowing.close()

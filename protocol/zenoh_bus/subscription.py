@@ -128,6 +128,11 @@ class ZenohSubscription:
         """Number of messages that were lost on the way."""
         return self._sequence.missed
 
+    @property
+    def waiting(self) -> int:
+        """Number of messages that wait for the handler."""
+        return self._delivery.waiting
+
     def close(self) -> None:
         """Let the handler finish the queued messages, for one second at most, and end the threads."""
         self._stop.set()

@@ -20,6 +20,7 @@ Reason: TypeAlias = Literal[
     "depth",
     "heading",
     "other_lights",
+    "overload",
     "out_of_range",
     "ambiguous",
     "degenerate",

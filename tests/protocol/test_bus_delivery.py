@@ -52,8 +52,10 @@ def test_one_queue_delays_and_drops_only_its_own_items() -> None:
         queue.offer(f"a {number}", queue="a")
     queue.offer("held before")
     assert queue.dropped == 900
+    assert queue.waiting == 104
     go_on.set()
     queue.close(PATIENCE_S)
+    assert queue.waiting == 0
     assert handled[:2] == ["first", "held before"]
     assert [item for item in handled if item.startswith("a")] == ["a 0", "a 1", "a 2"]
     assert max(handled.index(f"a {number}") for number in range(3)) < 10

@@ -1,12 +1,17 @@
 """The live service's own part: it tells the core what time it is, and publishes what the core makes."""
 
+from collections import Counter
+from types import SimpleNamespace
+
+import pytest
 from buddyline.protocol.bus import Received
 from buddyline.protocol.clock import S_NS, ManualClock
 from buddyline.protocol.codec import encode
-from buddyline.protocol.messages import Candidates, SolverStatus
+from buddyline.protocol.messages import Candidates, NodeInfo, Rejected, RelativePose, SolverStatus
 from buddyline.protocol.topics import key_of
 from buddyline.solver_service import service as service_module
 from buddyline.solver_service.config import SolverConfig
+from buddyline.solver_service.resting import CROWD, LOOKS
 from buddyline.solver_service.service import SolverService
 from msgspec.structs import replace
 
@@ -71,3 +76,75 @@ def test_the_configuration_restricts_and_what_is_not_used_is_named(dive):
     service.report()
     (said,) = (m for m in bus.published if isinstance(m, SolverStatus))
     assert (said.node_a, said.node_b, said.unused) == ("c", "a", ["b", "d"])
+
+
+def outcomes_of(bus):
+    return [one for one in bus.published if isinstance(one, RelativePose | Rejected)]
+
+
+def test_messages_that_wait_are_solved_together_and_give_the_same(dive, monkeypatch):
+    """One solver has a queue behind each message, the other has not."""
+    calls, said = [], []
+    handle = service_module.SolverCore.handle_many
+    monkeypatch.setattr(
+        service_module.SolverCore, "handle_many", lambda core, *args: calls.append(1) or handle(core, *args)
+    )
+    monkeypatch.setattr(service_module, "GATHER_S", 1e9)
+    for waiting in (0, 1):
+        bus, clock = Capture(), ManualClock()
+        service = SolverService(SolverConfig(nodes=["a", "b"]), clock=clock)
+        service.attach(bus)
+        service._subscription = SimpleNamespace(waiting=waiting)
+        calls.clear()
+        for message in dive[0]:
+            clock.set_ns(message.stamp_ns)
+            take(service, message)
+        service._subscription.waiting = 0
+        service.tick(status_due=False)
+        service._publish(service.core.flush())
+        said.append([(one.trigger, getattr(one, "reason", "")) for one in outcomes_of(bus)])
+        assert (len(calls) < len(dive[0]) / 50) is bool(waiting)
+    assert said[0] == said[1]
+    assert len(said[0]) > 20
+
+
+@pytest.mark.parametrize("nodes", [2, CROWD])
+def test_a_solver_that_cannot_keep_up_says_so_and_in_a_crowd_solves_less(dive, nodes, monkeypatch):
+    """The frames of each node wait for four seconds in it, until the queue is empty."""
+    monkeypatch.setattr(service_module, "GATHER_S", 0.0)
+    bus, clock = Capture(), ManualClock()
+    service = SolverService(SolverConfig(), clock=clock)
+    service.attach(bus)
+    service._subscription = SimpleNamespace(waiting=1)
+    frames = [m for m in dive[0] if m.node == "a" and isinstance(m, Candidates)]
+    infos = [m for m in dive[0] if m.node == "a" and isinstance(m, NodeInfo)]
+    slow, after = frames[: len(frames) // 2], frames[len(frames) // 2 :]
+    names = "abcdefgh"[:nodes]
+
+    def receive(message, late_ns):
+        for node in names:
+            one = replace(message, node=node)
+            clock.set_ns(one.stamp_ns + late_ns)
+            service.receive(Received(key_of(one), encode(one), one.stamp_ns, ""))
+
+    for message in infos + slow:
+        receive(message, 4 * S_NS)
+    service._take_all()
+    service.report()
+    (problem,) = {m.problem for m in bus.published if isinstance(m, SolverStatus)}
+    assert "the solver is 4 s behind" in problem
+    service._subscription.waiting = 0
+    service.tick(status_due=False)
+    for message in after:
+        receive(message, 0)
+    bus.published, seen = [], bus.published
+    service.report()
+    assert not any("behind" in m.problem for m in bus.published if isinstance(m, SolverStatus))
+    service._publish(service.core.flush())
+    bus.published = seen + bus.published
+    told = outcomes_of(bus)
+    pairs = nodes * (nodes - 1) // 2
+    assert Counter(one.trigger for one in told) == {frame.trigger: pairs for frame in frames}
+    left_out = {one.trigger for one in told if isinstance(one, Rejected) and one.reason == "overload"}
+    assert left_out <= {frame.trigger for frame in slow if frame.trigger % LOOKS}
+    assert bool(left_out) is (nodes == CROWD)

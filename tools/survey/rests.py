@@ -27,8 +27,8 @@ SAME_SHARE: Final = 0.06
 LEAST_RUN: Final = 3
 FEEL_NS: Final = 500_000_000
 GRAVITY_MPS2: Final = 9.80665
-# Reasons that mean that a node looked away, or that the link lost a frame.
-UNSEEN: Final = ("unmatched", "no_info", "too_few_candidates", "late", "duplicate")
+# Reasons that mean that a node looked away, that the link lost a frame, or that the solver had no time.
+UNSEEN: Final = ("unmatched", "no_info", "too_few_candidates", "late", "duplicate", "overload")
 
 
 @dataclass(frozen=True, eq=False)
