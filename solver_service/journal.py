@@ -39,8 +39,9 @@ KEPT_S: Final = 600.0
 class Noted:
     """What earlier solvers at this hub have received and said.
 
-    said: answers, in their order. recent: key and payload of the outcomes of the last minute, as they were published.
-    frames: node, trigger and stamp of the frames of this dive.
+    said: answers, in their order. recent: key and payload, as they were published, of the outcomes of the last minute;
+    of a solver that was behind, and wrote in the last minute, those of the minute before its newest. frames: node,
+    trigger and stamp of the frames of this dive.
     """
 
     said: list[Answer] = field(default_factory=list)
@@ -79,8 +80,9 @@ class Journal:
         """Return what is noted, of these pairs if given; a line that was cut off is left out. now_ns: wall clock."""
         wanted = None if pairs is None else {topic.key(*pair).encode() for pair in pairs for topic in (POSE, REJECTED)}
         past = Noted()
-        recent: list[tuple[int, str, bytes]] = []
-        for line in self._lines():
+        noted: list[tuple[Answer, str, bytes, bool]] = []
+        newest_ns: dict[tuple[str, str], int] = {}
+        for line, lately in self._lines(now_ns):
             key, _, payload = line.partition(b" ")
             if wanted is not None and key not in wanted:
                 continue
@@ -98,23 +100,35 @@ class Journal:
             if (parsed := parse_key(named)) is None or parsed[0] not in (POSE, REJECTED):
                 continue
             past.said.append(one)
-            if abs(now_ns - one.stamp_ns) < CACHE_S * S_NS:
-                recent.append((one.stamp_ns, named, payload))
+            if abs(now_ns - one.stamp_ns) < THIS_DIVE_NS:
+                noted.append((one, named, payload, lately))
             if one.in_order:
+                pair = one.node_a, one.node_b
+                newest_ns[pair] = max(newest_ns.get(pair, 0), one.stamp_ns)
                 self._last[one.node_a, one.node_b] = line + b"\n"
         if self.path != self._common:
             past.said.sort(key=lambda one: one.stamp_ns)
-            recent.sort(key=lambda each: each[0])
-        past.recent = [each[1:] for each in recent]
+            noted.sort(key=lambda each: each[0].stamp_ns)
+        past.recent = [
+            (named, payload)
+            for one, named, payload, lately in noted
+            if abs(now_ns - one.stamp_ns) < CACHE_S * S_NS
+            # What was noted last may not have been sent, however old it was then.
+            or (lately and abs(newest_ns.get((one.node_a, one.node_b), 0) - one.stamp_ns) < CACHE_S * S_NS)
+        ]
         return past
 
-    def _lines(self) -> Iterator[bytes]:
-        """Yield the lines of this journal; of a shared one those of all solvers, whose old files are removed."""
+    def _lines(self, now_ns: int) -> Iterator[tuple[bytes, bool]]:
+        """Yield the lines of this journal, and whether their file was written to in the last minute.
+
+        Of a shared journal those of all solvers, whose old files are removed.
+        """
         is_shared = self.path != self._common
         of_all = sorted(self._common.parent.glob(f"{self._common.name}.*"), key=_is_current) if is_shared else []
         for path in [_before(self._common), self._common, *of_all]:
             with contextlib.suppress(OSError):
-                yield from path.read_bytes().splitlines()
+                lately = abs(now_ns / S_NS - path.stat().st_mtime) < CACHE_S
+                yield from ((line, lately) for line in path.read_bytes().splitlines())
                 if path in of_all and path != self.path and time.time() - path.stat().st_mtime > KEPT_S:
                     path.unlink()
 

@@ -203,6 +203,9 @@ class SolverService(Service):
 
     def _share(self, work: SharedWork, bus: Bus) -> None:
         """Go on with the tasks that are this solver's now."""
+        if self._joined_ns != 0 and self._more_waits:
+            # What the nodes have held comes first: until all of it is in, the others can do more with the pairs.
+            return
         hub = bus.hub
         with self._turn():
             begin = work.tick(hub)

@@ -1,5 +1,9 @@
 """What a live solver has received and answered outlives a kill of solver and hub."""
 
+import os
+import time
+
+import pytest
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.codec import encode
 from buddyline.protocol.messages import Candidates, Rejected
@@ -54,6 +58,20 @@ def test_outcomes_of_the_last_minute_and_frames_of_this_dive_are_read_back_as_th
     assert past.said == [answer_of(one) for one in said]
     assert past.recent == [(key_of(one), encode(one)) for one in said[1:]]
     assert past.frames == [("a", k, frame(k).stamp_ns) for k in (2, 3)]
+
+
+@pytest.mark.parametrize("lately", [True, False])
+def test_what_a_solver_that_was_behind_noted_last_is_read_back_too(tmp_path, lately):
+    """It may not have been sent, unless it was noted long ago."""
+    now_ns, path = time.time_ns(), tmp_path / "solver.answered"
+    said = [
+        Rejected(node_a="a", node_b="b", stamp_ns=now_ns - ago_s * S_NS, trigger=300 - ago_s, reason="ambiguous")
+        for ago_s in (160, 95, 90)
+    ]
+    Journal(path).add(said)
+    if not lately:
+        os.utime(path, (0, now_ns / S_NS - 70))
+    assert Journal(path).read(now_ns).recent == [(key_of(one), encode(one)) for one in said[1:] if lately]
 
 
 def test_one_that_takes_over_a_pair_reads_of_no_other(tmp_path):

@@ -3,6 +3,7 @@
 import tempfile
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from buddyline.protocol.clock import ManualClock
@@ -125,6 +126,30 @@ def test_the_pairs_of_one_that_is_gone_go_on_and_nothing_is_answered_twice(team)
     team.solvers.pop(gone).close()
     team.play(40)
     team.tick()
+    assert team.doing() == sorted(PAIRS)
+    team.finish()
+    team.check()
+
+
+def test_one_that_joins_claims_nothing_before_what_the_nodes_held_is_in(team):
+    one = team.join()
+    team.play(60)
+    team.tick()
+    assert team.doing() == sorted(PAIRS)
+    two = SolverService(SolverConfig(share=True, track=TrackConfig(rate_hz=0.0)), clock=team.clock)
+    bus = team.network.connect()
+    two.attach(bus)
+    bus.watch_alive(two.watch)
+    until(lambda: one._work.sharing.name in two._work.sharing._alive)
+    subscription, two._subscription = two._subscription, SimpleNamespace(waiting=1)
+    for _ in range(4):
+        team.now_s += 0.6
+        two.tick(False)
+    assert not two._shown
+    two._subscription = subscription
+    team.solvers[two] = bus
+    team.tick()
+    assert two._shown
     assert team.doing() == sorted(PAIRS)
     team.finish()
     team.check()
