@@ -253,8 +253,12 @@ class SolverCore:
         if stream is None:
             return ()
         if isinstance(message, NodeInfo) and not (message.has_camera and message.has_lights):
-            # Only nodes that can see each other form a pair.
+            # Only nodes that can see each other form a pair. Frames may have come before the calibration.
             self._single.add(stream.node)
+            if self._chosen is None and not self._shared:
+                for nodes in self.pairs_of(stream.node):
+                    self.release(nodes)
+                self._pairs_of.pop(stream.node, None)
         formed = self._chosen is not None or stream.node in self._pairs_of or stream.node in self._single
         if isinstance(message, NodeInfo | Candidates) and not formed:
             self._form_pairs(stream, now_ns)

@@ -298,6 +298,24 @@ def test_a_node_that_appears_later_is_paired_with_what_the_others_still_hold(div
     assert sum(isinstance(r, RelativePose) for r in results) > 0.8 * len(results)
 
 
+def test_a_node_without_lamps_is_in_no_pair_though_its_frames_came_first(dive):
+    """Live a frame may overtake the calibration, which then says that c has a camera alone."""
+    messages, _ = dive
+    frames = [msgspec.structs.replace(m, node="c") for m in messages if m.node == "b" and isinstance(m, Candidates)]
+    info = next(m for m in messages if isinstance(m, NodeInfo) and m.node == "b")
+    core = SolverCore(Settings())
+    first = [next(m for m in messages if isinstance(m, NodeInfo) and m.node == "a"), *frames[:3]]
+    assert [result for message in first for result in core.handle(message)] == []
+    assert list(core.pairs) == [("a", "c")]
+    core.handle(msgspec.structs.replace(info, node="c", role="camera"))
+    assert list(core.pairs) == []
+    others = sorted([*messages, *frames[3:]], key=lambda m: (m.stamp_ns, isinstance(m, Candidates)))
+    results = [result for message in others for result in core.handle(message)] + core.flush()
+    assert list(core.pairs) == [("a", "b")]
+    assert {(result.node_a, result.node_b) for result in results} == {("a", "b")}
+    assert_each_ends_once(results, messages)
+
+
 def test_three_nodes_give_each_pair_what_it_gives_alone(dive):
     """C is b over again: pair a, c gives what a, b gives, and b, c has its outcomes."""
     messages, _ = dive
