@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain, islice
 from typing import Final, TypeAlias
 
 import numpy as np
@@ -24,6 +26,7 @@ _LOG_SHARES: Final = np.log((1.0 - GROSS_SHARE, GROSS_SHARE))
 
 Case: TypeAlias = tuple[tuple[int, int] | None, tuple[int, int] | None]
 """For both lights the candidate and whether it is off by a gross error, None where the light is missing."""
+_Option: TypeAlias = tuple[float, int, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,27 +43,56 @@ class Association:
     evidence: float
 
 
+@dataclass(frozen=True, eq=False)
+class Odds:
+    """Every assignment of one picture's candidates, and the logs (N,) of their densities over clutter.
+
+    How likely each light is found is left out: that is learned from picture to picture.
+    """
+
+    cases: list[Case]
+    logs: Floats
+
+    def weighed(self, detection: Floats) -> tuple[list[Case], Floats]:
+        """Give the assignments and the logs of their odds by how likely each light (2,) is found."""
+        cases, logs = self.cases, self.logs
+        if not detection.all():
+            lit = detection.tolist()
+            kept = [n for n, case in enumerate(cases) if all(lit[k] or one is None for k, one in enumerate(case))]
+            cases, logs = [cases[n] for n in kept], logs[kept]
+        first, second = (
+            (math.log(max(1.0 - found, 1e-6)), math.log(found) if found > 0.0 else -math.inf)
+            for found in detection.tolist()
+        )
+        return cases, logs + [first[one is not None] + second[two is not None] for one, two in cases]
+
+    def associate(self, sigma_px: Floats, detection: Floats) -> Association:
+        """Choose the lights that are sure. sigma_px (K,): of the candidates, for the variance of the chosen."""
+        cases, logs = self.weighed(detection)
+        top = float(logs.max())
+        weights = np.exp(logs - top)
+        total = float(weights.sum())
+        weights /= total
+        marginal: dict[tuple[int, int], list[float]] = {}
+        seen = [0.0, 0.0]
+        for case, weight in zip(cases, weights.tolist(), strict=True):
+            for light, picked in enumerate(case):
+                if picked is not None:
+                    seen[light] += weight
+                    marginal.setdefault((picked[0], light), [0.0, 0.0])[picked[1]] += weight
+        chosen: list[tuple[int, int, float]] = []
+        for (k, light), (common, gross) in sorted(marginal.items()):
+            if common + gross > SURE:
+                chosen.append((k, light, variance_of(float(sigma_px[k]), common, gross)))
+        return Association(tuple(chosen), np.array(seen), top + math.log(total))
+
+
 def associate(
     y: Floats, H: Floats, P: Floats, sigma_px: Floats, detection: Floats, clutter_per_px2: float
 ) -> Association:
     """Weigh every assignment of candidates (K) to two lights, each of which may be missing; arguments as of `weigh`."""
-    cases, logs = weigh(y, H, P, sigma_px, detection, clutter_per_px2)
-    top = float(logs.max())
-    weights = np.exp(logs - top)
-    total = float(weights.sum())
-    weights /= total
-    marginal: dict[tuple[int, int], list[float]] = {}
-    seen = np.zeros(2)
-    for case, weight in zip(cases, weights.tolist(), strict=True):
-        for light, picked in enumerate(case):
-            if picked is not None:
-                seen[light] += weight
-                marginal.setdefault((picked[0], light), [0.0, 0.0])[picked[1]] += weight
-    chosen: list[tuple[int, int, float]] = []
-    for (k, light), (common, gross) in sorted(marginal.items()):
-        if common + gross > SURE:
-            chosen.append((k, light, variance_of(float(sigma_px[k]), common, gross)))
-    return Association(tuple(chosen), seen, top + math.log(total))
+    [odds] = odds_of(y[None], H[None], P[None], sigma_px[None], np.array((clutter_per_px2,)))
+    return odds.associate(sigma_px, detection)
 
 
 def variance_of(sigma_px: float, common: float, gross: float) -> float:
@@ -78,79 +110,73 @@ def weigh(
     y (K, 2, 2), H (K, 2, 2, C): residuals and Jacobians, by candidate and light; P (C, C): covariance of the errors.
     detection (2,): how likely each light is to be among the candidates. The odds are against clutter alone.
     """
-    options: tuple[list[tuple[float, int, int]], list[tuple[float, int, int]]] = ([], [])
-    if len(y):
-        y = np.where(np.isfinite(y), y, NOWHERE_PX)
-        _weigh_single(options, y, H, P, sigma_px, detection, math.log(clutter_per_px2))
-    misses = [math.log(max(1.0 - detection[light], 1e-6)) for light in range(2)]
-
-    cases: list[Case] = [(None, None)]
-    logs = [misses[0] + misses[1]]
-    for log_l, k, mode in options[0]:
-        cases.append(((k, mode), None))
-        logs.append(log_l + misses[1])
-    for log_l, k, mode in options[1]:
-        cases.append((None, (k, mode)))
-        logs.append(log_l + misses[0])
-    pairs = [(one[1:], two[1:]) for one in options[0] for two in options[1] if one[1] != two[1]]
-    if pairs:
-        cases += pairs
-        logs += _weigh_pairs(np.array(pairs), y, H, P, sigma_px, detection, math.log(clutter_per_px2))
-    return cases, np.array(logs)
+    [odds] = odds_of(y[None], H[None], P[None], sigma_px[None], np.array((clutter_per_px2,)))
+    return odds.weighed(detection)
 
 
-def _weigh_single(
-    options: tuple[list[tuple[float, int, int]], list[tuple[float, int, int]]],
-    y: Floats,
-    H: Floats,
-    P: Floats,
-    sigma_px: Floats,
-    detection: Floats,
-    log_clutter: float,
-) -> None:
-    """Add, for each light, the likeliest candidates in their order: log of the density over clutter, candidate, mode.
+def odds_of(y: Floats, H: Floats, P: Floats, sigma_px: Floats, clutter_per_px2: Floats) -> list[Odds]:
+    """Give the odds of pictures (N), their arguments as of `weigh`: y (N, K, 2, 2), P (N, C, C), clutter (N,).
 
-    mode: 1 where the candidate is off by a gross error.
+    Where a picture has fewer candidates than others, the rest have infinite residuals, H of 0 and sigmas of 1.
     """
-    S = H @ P @ np.swapaxes(H, -1, -2)
-    variance = _variances(sigma_px)[:, :, None]  # (2 modes, K, 1)
-    a, b, c = S[..., 0, 0] + variance, S[..., 0, 1], S[..., 1, 1] + variance
-    u, v = y[..., 0], y[..., 1]
+    y = np.where(np.isfinite(y), y, NOWHERE_PX)
+    log_clutter = np.log(clutter_per_px2) + math.log(2.0 * math.pi)
+    variances = np.array((0.0, GROSS_PX**2))[:, None] + (sigma_px * sigma_px)[:, None]  # (N, 2 modes, K)
+    options = _single(y, H, P, variances, log_clutter)
+    pairs = [[(one[1:], two[1:]) for one in first for two in second if one[1] != two[1]] for first, second in options]
+    counts = list(map(len, pairs))
+    joint: Iterator[float] = iter(())
+    if any(counts):
+        at, picked = np.repeat(np.arange(len(pairs)), counts), np.array([pair for found in pairs for pair in found])
+        joint = iter(_both(at, picked, y, H, P, variances, log_clutter))
+    every = []
+    for (first, second), found in zip(options, pairs, strict=True):
+        cases: list[Case] = [(None, None), *((one[1:], None) for one in first), *((None, two[1:]) for two in second)]
+        logs = [0.0, *(one[0] for one in first), *(two[0] for two in second), *islice(joint, len(found))]
+        every.append(Odds([*cases, *found], np.array(logs)))
+    return every
+
+
+def _single(
+    y: Floats, H: Floats, P: Floats, variances: Floats, log_clutter: Floats
+) -> list[tuple[list[_Option], list[_Option]]]:
+    """Give, for each picture's lights, the likeliest candidates in their order.
+
+    Of each the log of the density over clutter, the candidate, and its mode: 1 where it is off by a gross error.
+    """
+    S = (H @ P[:, None, None] @ np.swapaxes(H, -1, -2))[:, None]  # (N, 1, K, 2, 2, 2)
+    a, b, c = S[..., 0, 0] + variances[..., None], S[..., 0, 1], S[..., 1, 1] + variances[..., None]
+    u, v = y[:, None, ..., 0], y[:, None, ..., 1]
     det = a * c - b * b
     chi2 = (c * (u * u) - 2.0 * b * (u * v) + a * (v * v)) / det
-    log_l = -0.5 * (chi2 + np.log(det)) - (math.log(2.0 * math.pi) + log_clutter) + _LOG_SHARES[:, None, None]
+    log_l = _LOG_SHARES[:, None, None] - 0.5 * (chi2 + np.log(det)) - log_clutter[:, None, None, None]
     # A lamp that is nowhere in the picture is no candidate's, however little the track knows.
-    for mode, k, light in np.argwhere((chi2 < GATE) & (np.abs(y).max(axis=-1) < NOWHERE_PX)).tolist():
-        if detection[light] > 0.0:
-            options[light].append((float(log_l[mode, k, light]) + math.log(detection[light]), k, mode))
-    for found in options:
+    near = np.argwhere((chi2 < GATE) & (np.abs(y).max(axis=-1) < NOWHERE_PX)[:, None])
+    options: list[tuple[list[_Option], list[_Option]]] = [([], []) for _ in y]
+    for (n, mode, k, light), log in zip(near.tolist(), log_l[tuple(near.T)].tolist(), strict=True):
+        options[n][light].append((log, k, mode))
+    for found in chain.from_iterable(options):
         found.sort(reverse=True)
         del found[MAX_OPTIONS:]
+    return options
 
 
-def _weigh_pairs(
+def _both(
+    at: NDArray[np.intp],
     pairs: NDArray[np.intp],
     y: Floats,
     H: Floats,
     P: Floats,
-    sigma_px: Floats,
-    detection: Floats,
-    log_clutter: float,
+    variances: Floats,
+    log_clutter: Floats,
 ) -> list[float]:
-    """Give the logs of the joint densities over clutter; pairs (N, 2 lights, 2): candidate, mode."""
-    k, mode = pairs[:, :, 0], pairs[:, :, 1]
-    light = np.array((0, 1))
-    H_both = H[k, light].reshape(len(pairs), 4, -1)
-    y_both = y[k, light].reshape(len(pairs), 4)
-    S = H_both @ P @ np.swapaxes(H_both, 1, 2)
-    S[:, range(4), range(4)] += np.repeat(_variances(sigma_px)[mode, k], 2, axis=1)
+    """Give the logs of the joint densities over clutter; pairs (M, 2 lights, 2): candidate, mode; at (M,): picture."""
+    k, mode, light, of = pairs[:, :, 0], pairs[:, :, 1], np.array((0, 1)), at[:, None]
+    H_both = H[of, k, light].reshape(len(pairs), 4, -1)
+    y_both = y[of, k, light].reshape(len(pairs), 4)
+    S = H_both @ P[at] @ np.swapaxes(H_both, 1, 2)
+    S[:, range(4), range(4)] += np.repeat(variances[of, mode, k], 2, axis=1)
     chi2 = (y_both * np.linalg.solve(S, y_both[..., None])[..., 0]).sum(axis=1)
-    logs = -0.5 * (chi2 + np.linalg.slogdet(S)[1]) + _LOG_SHARES[mode].sum(axis=1)
-    logs += math.log(detection[0] * detection[1]) - 2.0 * (math.log(2.0 * math.pi) + log_clutter)
+    logs = -0.5 * (chi2 + np.linalg.slogdet(S)[1]) + _LOG_SHARES[mode].sum(axis=1) - 2.0 * log_clutter[at]
     weighed: list[float] = logs.tolist()
     return weighed
-
-
-def _variances(sigma_px: Floats) -> Floats:
-    """Give the variances (2 modes, K) of candidates that are off by a common, or by a gross error."""
-    return np.add.outer((0.0, GROSS_PX**2), sigma_px * sigma_px)

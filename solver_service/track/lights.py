@@ -25,7 +25,7 @@ def light_positions(
     """Give the other node's lights (L, 3) in the observer's camera frame at times dt_s (K,) after the state's.
 
     Returns X (K, L, 3) and D (K, L, 3, NAV + 1): dX by the errors of COLUMNS. rates_radps (2, 3): turn rates. Where all
-    times are one, or there is none, K is 1.
+    times are one, or there is none, K is 1. A batch of states has leading axes, and so have rates, times, X and D.
     Seen by A:  X = R_A^T (r + R_B l)
                 dX = R_A^T (dr + dt dv - [r + R_B l]x (phi_B - phi_A)) + R_A^T (v + R_B (w_B x l)) dclock
     Seen by B:  X = R_B^T d, d = R_A l - r
@@ -35,51 +35,51 @@ def light_positions(
     """
     other = 1 - observer
     # Without a rolling shutter all candidates are of one time.
-    alike = bool((dt_s == dt_s[:1]).all())
-    times = dt_s if not alike else dt_s[:1] if len(dt_s) else np.zeros(1)
+    alike = bool((dt_s == dt_s[..., :1]).all())
+    times = dt_s if not alike else dt_s[..., :1] if dt_s.shape[-1] else np.zeros((*dt_s.shape[:-1], 1))
+    r_m, v_mps = state.r_m[..., None, :], state.v_mps[..., None, :]
     # What the other node has turned on, or has yet to turn, by its own clock.
-    late_s = state.clock_s if observer == 0 else -state.clock_s
-    R_observer = state.R[observer] @ turns_over(rates_radps[observer], times)
-    R_other = state.R[other] @ turns_over(rates_radps[other], times + late_s)
-    arms = R_other @ lights_m.T  # (T, 3, L)
-    arms = np.swapaxes(arms, 1, 2)  # (T, L, 3)
-    swept = np.swapaxes(R_other @ (skew(rates_radps[other]) @ lights_m.T), 1, 2)
+    late_s = np.asarray(state.clock_s if observer == 0 else -state.clock_s)[..., None]
+    R_observer = state.R[..., observer, None, :, :] @ turns_over(rates_radps[..., observer, :], times)
+    R_other = state.R[..., other, None, :, :] @ turns_over(rates_radps[..., other, :], times + late_s)
+    arms = np.swapaxes(R_other @ lights_m.T, -1, -2)  # (T, L, 3)
+    across = skew(rates_radps[..., other, :]) @ lights_m.T
+    swept = np.swapaxes(R_other @ across[..., None, :, :], -1, -2)
     ahead_s = times + late_s if observer == 0 else times
-    r = (state.r_m + ahead_s[:, None] * state.v_mps)[:, None, :]
+    r = (r_m + ahead_s[..., None] * v_mps)[..., None, :]
     sign = 1.0 if observer == 0 else -1.0
     d = sign * r + arms
-    toward = np.swapaxes(R_observer, 1, 2)[:, None]  # (T, 1, 3, 3)
+    toward = np.swapaxes(R_observer, -1, -2)[..., None, :, :]  # (T, 1, 3, 3)
     X = (toward @ d[..., None])[..., 0]
     D = np.zeros((*X.shape, NAV + 1))
     D[..., 0:3] = sign * toward
-    D[..., 3:6] = D[..., 0:3] * ahead_s[:, None, None, None]
-    turn = toward @ skew((arms if observer == 0 else d) + state.r_m)
+    D[..., 3:6] = D[..., 0:3] * ahead_s[..., None, None, None]
+    turn = toward @ skew((arms if observer == 0 else d) + r_m[..., None, :])
     D[..., 6:9] = turn if observer == 0 else -turn
     D[..., 9:12] = -D[..., 6:9]
-    clock = state.v_mps + swept if observer == 0 else -swept
+    clock = v_mps[..., None, :] + swept if observer == 0 else -swept
     D[..., NAV] = (toward @ clock[..., None])[..., 0]
     return X, D
 
 
 def turns_over(rate_radps: Floats, times_s: Floats) -> Floats:
-    """Give the turns (T, 3, 3) at a rate (3,) over times (T,)."""
-    if len(times_s) == 1:
-        return rotation_exp(rate_radps * float(times_s[0]))[None]
-    return rotation_exp(rate_radps * times_s[:, None])
+    """Give the turns (..., T, 3, 3) at a rate (..., 3) over times (..., T)."""
+    return rotation_exp(rate_radps[..., None, :] * times_s[..., None])
 
 
 def residuals(bearings: Floats, tangents: Floats, X: Floats, D: Floats) -> tuple[Floats, Floats]:
     """Give how far each candidate (K) stands off each light (L), in px (K, L, 2), and the light's Jacobian.
 
     bearings (K, 3), tangents (K, 2, 3): of the candidates, as Camera.rays gives them. X (K or 1, L, 3), D (K or 1, L,
-    3, C): the lights, as `light_positions` gives them. The picture near a candidate is
-    its tangent plane: h = T X / (b . X), dh = (T - h b^T) dX / (b . X); y = -h. Infinite behind the camera.
+    3, C): the lights, as `light_positions` gives them; all with leading axes for a batch of pictures. The picture near
+    a candidate is its tangent plane: h = T X / (b . X), dh = (T - h b^T) dX / (b . X); y = -h. Infinite behind the
+    camera.
     """
-    depth = (X @ bearings[:, :, None])[..., 0]
+    depth = (X @ bearings[..., None])[..., 0]
     ahead = depth > 1e-3 * np.sqrt((X * X).sum(-1))
     safe = np.where(ahead, depth, 1.0)
-    h = X @ np.swapaxes(tangents, 1, 2) / safe[..., None]
-    slope = (tangents[:, None] - h[..., None] * bearings[:, None, None, :]) / safe[..., None, None]
+    h = X @ np.swapaxes(tangents, -1, -2) / safe[..., None]
+    slope = (tangents[..., None, :, :] - h[..., None] * bearings[..., None, None, :]) / safe[..., None, None]
     H = slope @ D
     y = np.where(ahead[..., None], -h, np.inf)
     return y, H

@@ -13,7 +13,6 @@ from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
-from buddyline.solver_service.track.association import associate
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import TrackNode
@@ -49,7 +48,7 @@ class PathFilter(TrackFilter):
         super().__init__(*nodes, keep_s=math.inf)
         self.restarts = False
         self._path = path
-        self._at = {(look.node, look.stamp_ns): (step, look) for step, looks in enumerate(path.looks) for look in looks}
+        self.guide_by(path)
         first = path.state(0)
         # Constants and walks are believed as at first, whatever a pass before made of the same lights: where that went
         # astray it has learned too small a walk.
@@ -78,13 +77,12 @@ class PathFilter(TrackFilter):
 
     def _take_sight(self, t_s: float, sight: Sight) -> None:
         self._check_units(t_s)
-        found = self._at.get((sight.node, sight.stamp_ns))
-        if found is None:
+        guide = self.guides.get((sight.node, sight.stamp_ns))
+        if guide is None:
             return
-        k, look = found
-        while self._k < k:
+        while self._k < guide.step:
             self._next(self.passed)
-        self._see(self.passed, sight, PassGuide(self._path, k, look))
+        self._see(self.passed, sight, guide)
 
     def _next(self, main: Estimate) -> None:
         """Go to the path's next step: its state there, and how far off that what is filtered is."""
@@ -115,9 +113,7 @@ class PathFilter(TrackFilter):
 
     def _see(self, main: Estimate, sight: Sight, guide: PassGuide) -> None:
         observer = sight.node
-        clutter = sight.clutter / self.nodes[observer].rig.camera.area_px2
-        detection = main.detection[observer]
-        found = associate(*self._without(guide, sight), sight.sigma_px, detection, clutter)
+        found = self._odds(guide, sight).associate(sight.sigma_px, main.detection[observer])
         main.evidence += found.evidence
         for light in (0, 1):
             old = main.detection[observer, light]

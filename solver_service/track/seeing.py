@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track import anchors
-from buddyline.solver_service.track.association import Association, associate
+from buddyline.solver_service.track.association import Association, Odds, associate, odds_of
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.inputs import TrackNode
 from buddyline.solver_service.track.lights import (
@@ -44,6 +45,8 @@ EDGE_PX: Final = 2.0
 WIDE_SHARE: Final = 0.02
 # A wide estimate takes its lights in so many steps.
 ABOUT_STEPS: Final = 4
+# The odds of so many pictures are worked out together at most.
+MOST_TOGETHER: Final = 256
 _STILL: Final = np.eye(MOVING)
 
 
@@ -65,6 +68,7 @@ class TrackSights(TrackMoves):
     def __init__(self, nodes: tuple[TrackNode, TrackNode]) -> None:
         super().__init__(nodes)
         self.guides: dict[tuple[int, int], PassGuide] = {}
+        self._by_all: dict[tuple[int, int], tuple[PassGuide, Odds]] = {}
 
     def guide_by(self, path: Path) -> None:
         """Tell what a pass knew at each picture."""
@@ -96,7 +100,7 @@ class TrackSights(TrackMoves):
         elif guide is None:
             found = associate(y, H, estimate.covariance[BLOCK], sight.sigma_px, detection, clutter)
         else:
-            found = associate(*self._without(guide, sight), sight.sigma_px, detection, clutter)
+            found = self._odds(guide, sight).associate(sight.sigma_px, detection)
         if wide and found.chosen and estimate.confirmed:
             y, H = self._about(estimate, sight, found.chosen, guide)
         # What another estimate chose may be behind the camera by this one.
@@ -132,29 +136,57 @@ class TrackSights(TrackMoves):
         y, H = residuals(sight.bearings, sight.tangents, X, D)
         return X, y, H
 
-    def _without(self, guide: PassGuide, sight: Sight) -> tuple[Floats, Floats, Floats]:
-        """Give residuals, Jacobians and covariance by all the dive but this picture.
+    def _odds(self, guide: PassGuide, sight: Sight) -> Odds:
+        """Give the odds of a picture's candidates by all the dive but this picture.
 
-        The picture's own part is taken out of the smoothed estimate: P' = P + K H P, K = P H^T (R - H P H^T)^-1.
+        They depend on the earlier pass alone: those of all pictures that wait are worked out together.
         """
-        path, step = guide.path, guide.step
-        after_s = guide.look.t_s - float(path.t_s[step])
-        _, y, H = self._compared(sight, path.state(step), path.rates_radps[step], after_s)
-        P = path.covariance(step)
-        chosen = _in_front(guide.look.chosen, y)
-        if chosen:
-            H_used = np.concatenate([H[k, light] for k, light, _ in chosen])
-            y_used = np.concatenate([y[k, light] for k, light, _ in chosen])
-            R = np.diag(np.repeat([variance for _, _, variance in chosen], 2))
-            across = P @ H_used.T
-            rest = R - H_used @ across
-            # Rounding, and pictures that share a step, can leave less than nothing.
-            values, vectors = np.linalg.eigh(rest)
-            inverse = (vectors / np.maximum(values, 0.02 * R[0, 0])) @ vectors.T
-            gain = across @ inverse
-            P = P + gain @ across.T
-            y = y + H @ (gain @ y_used)
-        return y, H, P
+        key = sight.node, sight.stamp_ns
+        if self._by_all.get(key, (None,))[0] is not guide:
+            waiting = [what for _, _, _, what in self._events if isinstance(what, Sight) and what.node == sight.node]
+            guided = [(self.guides.get((each.node, each.stamp_ns)), each) for each in waiting]
+            alike = [(by, each) for by, each in guided if by is not None and by.path is guide.path]
+            together = [(guide, sight), *alike[: MOST_TOGETHER - 1]]
+            for (by, each), odds in zip(together, self._odds_by(guide.path, together), strict=True):
+                self._by_all[each.node, each.stamp_ns] = by, odds
+        return self._by_all.pop(key)[1]
+
+    def _odds_by(self, path: Path, seen: Sequence[tuple[PassGuide, Sight]]) -> list[Odds]:
+        """Give the odds of one node's pictures, each by the path without what the picture has told it.
+
+        That is taken out of the smoothed estimate: P' = P + K H P, K = P H^T (R - H P H^T)^-1.
+        """
+        observer, count = seen[0][1].node, max(len(sight.bearings) for _, sight in seen)
+        at = np.array([guide.step for guide, _ in seen])
+        bearings, tangents = np.zeros((len(seen), count, 3)), np.zeros((len(seen), count, 2, 3))
+        sigma_px, dt_s = np.ones((len(seen), count)), np.empty((len(seen), count))
+        for n, (guide, sight) in enumerate(seen):
+            of = len(sight.bearings)
+            bearings[n, :of], tangents[n, :of], sigma_px[n, :of] = sight.bearings, sight.tangents, sight.sigma_px
+            dt_s[n, :of], dt_s[n, of:] = sight.dt_s, sight.dt_s[-1] if of else 0.0
+            dt_s[n] += guide.look.t_s - path.t_s[guide.step]
+        lights_m = self.nodes[1 - observer].rig.lights_m
+        X, D = light_positions(State.of_row(path.states[at]), observer, lights_m, path.rates_radps[at], dt_s)
+        y, H = residuals(bearings, tangents, X, D)
+        P = path.covariance(at)
+        # The rows of lights that a picture did not use stay 0, and tell nothing.
+        H_used, y_used, R = np.zeros((len(seen), 4, len(COLUMNS))), np.zeros((len(seen), 4)), np.ones((len(seen), 4))
+        for n, (guide, _) in enumerate(seen):
+            for row, (k, light, variance) in enumerate(_in_front(guide.look.chosen, y[n])):
+                rows = slice(2 * row, 2 * row + 2)
+                H_used[n, rows], y_used[n, rows], R[n, rows] = H[n, k, light], y[n, k, light], variance
+        across = P @ np.swapaxes(H_used, 1, 2)
+        rest = R[:, :, None] * np.eye(4) - H_used @ across
+        # Rounding, and pictures that share a step, can leave less than nothing.
+        values, vectors = np.linalg.eigh(rest)
+        inverse = (vectors / np.maximum(values, 0.02 * R[:, :1])[:, None]) @ np.swapaxes(vectors, 1, 2)
+        gain = across @ inverse
+        P = P + gain @ np.swapaxes(across, 1, 2)
+        y = y + (H @ (gain @ y_used[..., None])[:, None, None])[..., 0]
+        # Candidates that a picture does not have are nowhere.
+        y[~bearings.any(axis=2)] = np.inf
+        area_px2 = self.nodes[observer].rig.camera.area_px2
+        return odds_of(y, H, P, sigma_px, np.array([sight.clutter / area_px2 for _, sight in seen]))
 
     def _about(
         self, estimate: Estimate, sight: Sight, chosen: Chosen, guide: PassGuide | None

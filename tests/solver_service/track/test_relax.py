@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.track.association import weigh
 from buddyline.solver_service.track.dive import smooth
+from buddyline.solver_service.track.lights import COLUMNS, Sight
 from buddyline.solver_service.track.parts import parts_of
-from buddyline.solver_service.track.records import pass_over
+from buddyline.solver_service.track.records import feed, pass_over
 from buddyline.solver_service.track.relax import PathFilter
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.smoother import Path, smoothed
@@ -51,6 +53,40 @@ def test_passes_about_a_path_that_is_off_end_at_the_same_path() -> None:
     for _ in range(3):
         path = passed_about(dive, path)
     assert moved(path, right) < 0.01
+
+
+def test_pictures_are_weighed_together_by_all_the_dive_but_themselves() -> None:
+    """Each as by the information filter's own algebra: what the picture told is subtracted from the information."""
+    dive = make(7, Setting(seconds=6.0))
+    first = filter_of(dive.records, dive.fixes)
+    pass_over(first, dive.records, dive.fixes)
+    path = smoothed(parts_of(first)[0].steps)
+    again = filter_of(dive.records, ())
+    for node, record in enumerate(dive.records):
+        feed(again, node, record)
+    again.guide_by(path)
+    sights = {(sight.node, sight.stamp_ns): sight for _, _, _, sight in again._events if isinstance(sight, Sight)}
+    counts = set()
+    for node in (0, 1):
+        seen = [(guide, sights[key]) for key, guide in again.guides.items() if key[0] == node]
+        for (guide, sight), odds in zip(seen, again._odds_by(path, seen), strict=True):
+            k, after_s = guide.step, guide.look.t_s - float(path.t_s[guide.step])
+            _, y, H = again._compared(sight, path.state(k), path.rates_radps[k], after_s)
+            information, told = np.linalg.inv(path.covariance(k)), np.zeros(len(COLUMNS))
+            for at, light, variance in guide.look.chosen:
+                information = information - H[at, light].T @ H[at, light] / variance
+                told -= H[at, light].T @ y[at, light] / variance
+            P = np.linalg.inv(information)
+            clutter = sight.clutter / again.nodes[node].rig.camera.area_px2
+            detection = np.array((0.9, 0.8))
+            cases, logs = weigh(y - H @ (P @ told), H, P, sight.sigma_px, detection, clutter)
+            found, weighed = odds.weighed(detection)
+            # Which of two that hardly differ stands first may change by rounding.
+            assert sorted(map(str, found)) == sorted(map(str, cases))
+            by_case = dict(zip(map(str, cases), logs, strict=True))
+            assert weighed == pytest.approx([by_case[str(case)] for case in found], abs=1e-4)
+            counts.add((len(sight.bearings), len(guide.look.chosen)))
+    assert len(counts) > 5
 
 
 @pytest.mark.slow
