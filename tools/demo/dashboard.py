@@ -361,7 +361,7 @@ def slow_words(share: float | None) -> list[str]:
     if share is None or share >= ENOUGH_PICTURES:
         return []
     said = f"both pictures came for {share:.0%} of the triggers: this machine is busy, or too slow for the demo"
-    return [f"{said}; --rate 4 takes fewer"]
+    return [f"{said}; a lower --rate takes fewer"]
 
 
 def _track_words(mode: str, track: dict[str, Any]) -> str:
