@@ -2,11 +2,12 @@
 
 import sys
 import threading
-import time
+from types import SimpleNamespace
 
 import pytest
 from buddyline.node.config import CameraConfig, NodeConfig, PanelConfig, PowerConfig, RecordConfig, load_node_config
 from buddyline.node.service import NodeService
+from buddyline.node.underwater import panel as panel_module
 from buddyline.node.underwater import pins as pins_module
 from buddyline.node.underwater.codes import VERDICT_BEEPS, PanelAction, Verdict
 from buddyline.node.underwater.panel import Panel
@@ -312,6 +313,11 @@ def test_a_panel_that_cannot_be_is_refused_with_file_field_and_value(tmp_path, l
 def test_a_whole_node_takes_marks_by_the_button_and_shows_its_status(tmp_path, monkeypatch):
     import gpiozero
 
+    # Each turn of the panel is 20 ms of its time, however long a loaded machine takes for it.
+    turns = []
+    monkeypatch.setattr(
+        panel_module, "time", SimpleNamespace(monotonic_ns=lambda: turns.append(None) or len(turns) * TURN_NS)
+    )
     monkeypatch.setattr(gpiozero.Device, "pin_factory", mock.MockFactory())
     config = NodeConfig(
         node="a",
@@ -327,7 +333,8 @@ def test_a_whole_node_takes_marks_by_the_button_and_shows_its_status(tmp_path, m
         pin = gpiozero.Device.pin_factory.pin
         until(lambda: service.outlet.sent["candidates"] and pin(LIGHTS).function == "output" and pin(LIGHTS).state)
         pin(BUTTON).drive_low()
-        time.sleep(0.3)
+        pressed = len(turns)
+        until(lambda: len(turns) > pressed + 15)
         pin(BUTTON).drive_high()
         until(lambda: service.outlet.sent["mark"])
         until(lambda: service.status_message and service.status_message.lights_seen is not UNSET)
