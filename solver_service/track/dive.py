@@ -20,6 +20,7 @@ from buddyline.solver_service.track.moving import KNOWN_CLOCK_S
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.parts import (
     MOST_LEFT_S,
+    NEAR_CLOCK_S,
     clock_left_ns,
     clock_off_by,
     goes_on,
@@ -152,7 +153,8 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
             since_s = end_s
         pass_over(second, records, ())
         parts = parts_of(second)
-        if not any(clock_off_by(part, MOST_LEFT_S) for part in parts):
+        # Led astray by what was carried back, it finds other clocks than the first pass.
+        if not any(clock_off_by(part, NEAR_CLOCK_S if to_beginning else MOST_LEFT_S) for part in parts):
             return _smoothed(second, parts, outputs_ns)
     said = f"{second.both}: the second pass contradicts the first on the clocks, so it has diverged: no track"
     return Smoothed([], clock_ns * 1e-9, math.inf, [*second.problems, said])

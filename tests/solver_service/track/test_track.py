@@ -18,6 +18,7 @@ from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.lag import TrackLag
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.records import NodeRecord, Records, last_ns, pass_over
+from buddyline.solver_service.track.smoother import Path
 
 from tests.solver_service.track.dives import EPOCH_NS, KnownDive, Setting, filter_of, fix_errors, make, score
 
@@ -204,6 +205,33 @@ def test_a_second_pass_that_diverges_is_no_track(monkeypatch: pytest.MonkeyPatch
     found = smooth(short.records, short.fixes, short.stamps_ns)
     assert not list(found.rows)
     assert "it has diverged: no track" in found.problems[-1]
+
+
+def test_a_beginning_that_is_carried_back_wrong_does_not_lead_the_second_pass_astray(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The first start is 5 s late, and no light is seen before it: what is carried back is off by 40 % of the range."""
+    dive = make(73, Setting(seconds=14.0, sigma_px=0.1, false=1))
+    start_ns = EPOCH_NS + 5_000_000_000
+    records = [
+        replace(one, frames=[f for f in one.frames if not EPOCH_NS + 1_500_000_000 < f.stamp_ns < start_ns])
+        for one in dive.records
+    ]
+
+    def wrong(path: Path) -> Path:
+        states = path.states.copy()
+        states[:-1, :3] *= 1.4
+        return replace(path, states=states)
+
+    before = dive_track._path_before
+    monkeypatch.setattr(dive_track, "_path_before", lambda *given: (found := before(*given)) and wrong(found))
+    fixes = [fix for fix in dive.fixes if fix.stamp_ns > start_ns]
+    found = smooth((records[0], records[1]), fixes, dive.stamps_ns)
+    judged = score(dive, found.rows)
+    assert judged.wrong == 0
+    assert judged.covered > 0.9
+    assert judged.nees < 2.0
+    assert abs(found.clock_offset_s) < 3.0 * found.clock_sigma_s
 
 
 def test_a_wrong_fix_changes_nothing_for_long(dive: KnownDive) -> None:
