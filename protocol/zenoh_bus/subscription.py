@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
@@ -25,7 +26,8 @@ from buddyline.protocol.zenoh_bus.session import RETRY_S
 COPY: Final = b"copy"
 AGAIN: Final = b"again"
 QUERY_S: Final = 2.0
-# Gaps that are fetched at a time, each in a thread: of one owner of keys (protocol.sequence), and of all.
+# Gaps that are fetched at a time, each in a thread: of one owner of keys (protocol.sequence), and of all. An owner's
+# others wait: a link that lost a moment of a solver's outcomes lost those of many pairs.
 MAX_OWNER_GAPS: Final = 8
 MAX_GAPS: Final = 64
 # Queries for one gap.
@@ -77,6 +79,7 @@ class ZenohSubscription:
         self._sequence = SampleSequence[Arrived](self._deliver)
         self._repeats = Repeats(history=history)
         self._fetching: dict[threading.Thread, str] = {}
+        self._unfilled: deque[Gap] = deque()
         self._stop = threading.Event()
         self._asking = zenoh.CancellationToken()
         subscribers = [(key_expr, self._take, self._declare(key_expr)) for key_expr in key_exprs]
@@ -196,13 +199,14 @@ class ZenohSubscription:
             self._start_filling(self._sequence.heartbeat(source, last, newest_only=_newest_only(source.key)))
 
     def _start_filling(self, gap: Gap | None) -> None:
-        """Fetch a gap in a thread of its own; the lock is held."""
-        # Limited by owner: a client that invents publishers with gaps takes no thread from another's.
-        while gap is not None and (
-            list(self._fetching.values()).count(gap.source.owner) >= MAX_OWNER_GAPS or len(self._fetching) >= MAX_GAPS
-        ):
+        """Fetch a gap in a thread of its own, or once another of its owner is filled; the lock is held."""
+        # There is no more than one of each publisher, whose number is limited.
+        # By owner: a client that invents publishers with gaps takes no thread from another's.
+        while gap is not None and len(self._fetching) >= MAX_GAPS:
             gap = self._sequence.close(gap, [])
-        if gap is not None:
+        if gap is not None and list(self._fetching.values()).count(gap.source.owner) >= MAX_OWNER_GAPS:
+            self._unfilled.append(gap)
+        elif gap is not None:
             thread = threading.Thread(target=self._fill, args=(gap,), name=f"bus fetch {gap.source.key}", daemon=True)
             self._fetching[thread] = gap.source.owner
             thread.start()
@@ -220,7 +224,11 @@ class ZenohSubscription:
                 self._failures.report(f"bus fetch {gap.source.key}", error)
         finally:
             with self._lock:
-                self._fetching.pop(threading.current_thread(), None)
+                owner = self._fetching.pop(threading.current_thread(), "")
+                waiting = next((one for one in self._unfilled if one.source.owner == owner), None)
+                if waiting is not None and not self._stop.is_set():
+                    self._unfilled.remove(waiting)
+                    self._start_filling(waiting)
 
     def _fetch(self, gap: Gap) -> list[tuple[int, Arrived]]:
         """Return the messages of a gap that its publisher still holds; ask again for some time for what is missing."""
