@@ -18,6 +18,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--share", action="store_true", help="divide the pairs among all solvers of this hub that are started so"
     )
+    parser.add_argument(
+        "--lights",
+        action="append",
+        default=[],
+        metavar="FILE.json",
+        help="the NodeInfo of a buoy or tripod of lamps alone, which runs no program; may be given again",
+    )
     parser.add_argument("--seconds", type=above_zero, metavar="S", help="stop after this time")
 
 
@@ -34,6 +41,8 @@ def run(args: argparse.Namespace) -> int:
         config = msgspec.structs.replace(config, nodes=node_ids([args.nodes]), pairs=[])
     if args.share:
         config = msgspec.structs.replace(config, share=True)
+    if args.lights:
+        config = msgspec.structs.replace(config, lights=[*config.lights, *args.lights])
     service = SolverService(config, args.config or "defaults")
     service.handle_signals()
     service.start()

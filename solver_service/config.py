@@ -8,13 +8,15 @@ from pathlib import Path
 from typing import Annotated, cast
 
 from buddyline.protocol.config import Config, ConfigError, load_config
-from buddyline.protocol.messages import NodeId, TrackMode
+from buddyline.protocol.envelope import read_message
+from buddyline.protocol.errors import MessageError
+from buddyline.protocol.messages import NodeId, NodeInfo, TrackMode
 from buddyline.protocol.security import SOLVER, Tls, check_identity
 from buddyline.protocol.topics import check_node_id
 from buddyline.solver_service.choices import CHECKS, METHODS, TRACKS
 from buddyline.solver_service.geometry.observation import Method, Settings
 from buddyline.solver_service.tracking import TrackSettings
-from msgspec import Meta, field
+from msgspec import UNSET, Meta, field
 from msgspec.structs import replace
 
 # Rates of a stored dive's track: one row in ten seconds, and as many as a fast inertial unit has samples.
@@ -75,7 +77,8 @@ class SolverConfig(Config, frozen=True, kw_only=True):
 
     nodes: solve every pair of these nodes. pairs: solve these pairs, A first. Neither: solve every pair that appears.
     status_file: its path; "" for the runtime directory (protocol/statusfile.py). journal: where it keeps what it has
-    answered, so that it answers nothing twice; "" likewise. share: several solvers on one hub divide the pairs.
+    answered, so that it answers nothing twice; "" likewise. share: several solvers on one hub divide the pairs. lights:
+    files of the NodeInfo of buoys and tripods of lamps alone, which run no program; relative to the configuration's.
     """
 
     nodes: list[NodeId] = field(default_factory=list)
@@ -86,6 +89,7 @@ class SolverConfig(Config, frozen=True, kw_only=True):
     status_file: str = ""
     journal: str = ""
     share: bool = False
+    lights: list[str] = field(default_factory=list)
     solve: SolveConfig = field(default_factory=SolveConfig)
     track: TrackConfig = field(default_factory=TrackConfig)
 
@@ -103,6 +107,21 @@ class SolverConfig(Config, frozen=True, kw_only=True):
         """The pairs to solve; None for all that appear."""
         return self.pairs or list(combinations(self.nodes, 2)) or None
 
+    def lamps_alone(self) -> list[NodeInfo]:
+        """Read the files of `lights`; raise ConfigError naming file, field and value."""
+        infos: list[NodeInfo] = []
+        for path in map(Path, self.lights):
+            try:
+                info = read_message(path, NodeInfo)
+            except MessageError as error:
+                raise ConfigError(f"lights: {error}") from error
+            if info.role != "lights" or info.fixed is UNSET:
+                raise ConfigError(f'lights: {path}: node {info.node} has not role "lights" and a place (fixed)')
+            if info.node in (one.node for one in infos):
+                raise ConfigError(f"lights: {path}: node {info.node} is named twice")
+            infos.append(info)
+        return infos
+
 
 def node_ids(words: list[str]) -> list[str]:
     """Return the ids of `--nodes A B` or `--nodes A,B`; raise ConfigError unless they are two or more different ids."""
@@ -117,6 +136,7 @@ def load_solver_config(path: Path | str | None) -> SolverConfig:
     if path is None:
         return SolverConfig()
     config = load_config(path, SolverConfig)
+    config = replace(config, lights=[str(Path(path).parent / one) for one in config.lights])
     if config.tls is None:
         return config
     tls = config.tls.beside(path)

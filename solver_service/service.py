@@ -79,13 +79,17 @@ class SolverService(Service):
         self.config = config
         self.clock = clock or SystemClock()
         self.refusals = Refusals("solver")
+        lamps_alone = config.lamps_alone()
         self.core = SolverCore(
             config.solve.settings(source),
             config.chosen,
             align=True,
             track=config.track.settings,
+            lone=[info.node for info in lamps_alone],
             shared=config.share,
         )
+        for info in lamps_alone:
+            self.core.handle(info)
         self._lock = threading.Lock()
         self._bus: Bus | None = None
         self._subscription: Subscription | None = None

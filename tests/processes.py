@@ -150,12 +150,15 @@ class Process:
 
 
 @contextmanager
-def recorded_solver(out: Path) -> Iterator[tuple[str, Process]]:
-    """A hub, a solver and `record` into out; yields the hub's endpoint and the recorder, when all are connected."""
+def recorded_solver(out: Path, *arguments: object) -> Iterator[tuple[str, Process]]:
+    """A hub, a solver and `record` into out; yields the hub's endpoint and the recorder, when all are connected.
+
+    arguments: the solver's further ones.
+    """
     endpoint = free_endpoint()
     with (
         Process("hub", "--listen", endpoint) as hub,
-        Process("solver", "--connect", endpoint) as solver,
+        Process("solver", "--connect", endpoint, *arguments) as solver,
         Process("record", out, "--connect", endpoint) as record,
     ):
         hub.wait_for("listens")

@@ -42,8 +42,9 @@ def test_four_nodes_on_one_hub_are_in_one_frame(dive, tmp_path):
         assert found[node]["wrong"] == 0
 
 
-def test_a_tripod_of_lamps_alone_is_used_by_its_file(dive, tmp_path):
-    """Node c is fixed and has two lamps, no camera and no log: its NodeInfo comes from a file."""
+@pytest.fixture
+def tripod(dive, tmp_path):
+    """The NodeInfo of c in a file, as of a tripod of lamps alone, and the other nodes' logs."""
     with DiveLogReader(dive) as reader:
         told = [record.open().message for record in reader.records(lambda key: key == "buddyline/node/c/info")]
         true = [record.open() for record in reader.records(lambda key: key == "buddyline/net/main/truth/c")]
@@ -57,8 +58,24 @@ def test_a_tripod_of_lamps_alone_is_used_by_its_file(dive, tmp_path):
             for record in reader.records(lambda key, own=f"buddyline/node/{node}/": key.startswith(own)):
                 if "truth" not in record.key:
                     writer.write_message(record.open().message)
+    return tmp_path / "c.json", logs
+
+
+@pytest.mark.slow
+def test_a_live_solver_takes_a_tripod_of_lamps_alone_from_its_file(tripod, tmp_path):
+    lamps, logs = tripod
+    live = tmp_path / "live.mcap"
+    with recorded_solver(live, "--lights", lamps) as (endpoint, _):
+        played = buddyline("play", *logs, "--connect", endpoint)
+        assert played.returncode == 0, played.stderr
+        until(lambda: all(told_of(live, node) > 25 for node in "abcd"), 0.3)
+
+
+def test_a_tripod_of_lamps_alone_is_used_by_its_file(tripod, tmp_path):
+    """Node c is fixed and has two lamps, no camera and no log: its NodeInfo comes from a file."""
+    lamps, logs = tripod
     out = tmp_path / "out.mcap"
-    done = buddyline("solve", *logs, "-o", out, "--track", "filter", "--info", f"c={tmp_path / 'c.json'}", "--json")
+    done = buddyline("solve", *logs, "-o", out, "--track", "filter", "--info", f"c={lamps}", "--json")
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)
     assert {(one["node_a"], one["node_b"]) for one in told["pairs"]} == {("a", "b"), ("a", "d"), ("b", "d")}

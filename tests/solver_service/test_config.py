@@ -1,9 +1,14 @@
 """Which pairs are solved."""
 
 import pytest
+from buddyline.protocol.codec import encode
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import FixedPlace
 from buddyline.solver_service.config import load_solver_config, node_ids
+from msgspec.structs import replace
+
+from tests.fuzz.samples import SOUND
 
 
 def load(tmp_path, text):
@@ -39,3 +44,18 @@ def test_nodes_of_the_command_line():
     for words in (["a"], ["a", "a"], ["a,B"]):
         with pytest.raises(BuddylineError, match=r"different|node id"):
             node_ids(words)
+
+
+def test_lamps_alone_come_from_files_beside_the_configuration(tmp_path):
+    fixed = FixedPlace(p_m=(0.0, 0.0, 0.0), q_xyzw=(0.0, 0.0, 0.0, 1.0), sigma_m=0.1, sigma_rad=0.1)
+    info = replace(SOUND[0], node="c", role="lights", fixed=fixed)
+    (tmp_path / "c.json").write_bytes(encode(info))
+    (named,) = load(tmp_path, 'lights = ["c.json"]').lamps_alone()
+    assert (named.node, named.fixed) == ("c", fixed)
+    with pytest.raises(ConfigError, match=r"c\.json: node c is named twice"):
+        load(tmp_path, 'lights = ["c.json", "c.json"]').lamps_alone()
+    with pytest.raises(ConfigError, match=r"lights: .*d\.json: cannot be read"):
+        load(tmp_path, 'lights = ["d.json"]').lamps_alone()
+    (tmp_path / "c.json").write_bytes(encode(replace(info, role="full")))
+    with pytest.raises(ConfigError, match=r'c\.json: node c has not role "lights"'):
+        load(tmp_path, 'lights = ["c.json"]').lamps_alone()
