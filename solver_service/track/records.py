@@ -129,6 +129,7 @@ def pass_over(
 
     start_ns, stop_ns: of the part of the dive to take in, in whole pieces; a later call goes on from there.
     """
+    track.passes = True
     frames_ns = np.array([frame.stamp_ns for record in records for frame in record.frames], dtype=np.int64)
     ends_ns = (np.unique(frames_ns // PIECE_NS) + 1) * PIECE_NS
     for end_ns in [*ends_ns[(ends_ns > start_ns) & (ends_ns < stop_ns)].tolist(), stop_ns]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.strapdown import Bools, Noise
+from numpy.typing import NDArray
 
 # Further apart, and what lies between two samples is not told.
 GAP_S: Final = 0.06
@@ -16,6 +18,19 @@ _NOISE_SPAN_S: Final = 2.0
 # Below these densities what the model leaves out rules: scale, cross-axis, interpolation, shake.
 GYRO_FLOOR: Final = 1e-4
 ACCEL_FLOOR: Final = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class SampleSteps:
+    """One node's samples in steps (M): times_s (M, P), values (M, P, 13) and slow_radps (M, 2, 3) as in SampleGrid.
+
+    The last point of a step is repeated where others have more. told (M,): whether samples tell all of the step.
+    """
+
+    times_s: Floats
+    values: Floats
+    slow_radps: Floats
+    told: Bools
 
 
 class Samples:
@@ -115,6 +130,49 @@ class Samples:
         if self.shares.any():
             at[:, :6] -= np.repeat(self.shares, 3) * at[:, 6:12]
         return grid, at, told
+
+    def steps(self, edges_s: Floats, hold_s: float) -> SampleSteps:
+        """Give the steps between edges (M + 1,) as `between` and `slow_rate` would, where samples tell all of them.
+
+        hold_s: nothing later than this after a step's end is looked at.
+        """
+        t, starts, ends = self.times_s, edges_s[:-1], edges_s[1:]
+        if len(t) < 2 or not self.trusted:
+            steps = len(starts)
+            return SampleSteps(
+                np.zeros((steps, 2)), np.zeros((steps, 2, 13)), np.zeros((steps, 2, 3)), np.zeros(steps, bool)
+            )
+        first, stop = t.searchsorted(starts, side="right"), t.searchsorted(ends, side="left")
+        known = np.minimum(stop, len(t) - 1)
+        told = (first > 0) & (stop > first) & (stop < len(t)) & (t[known] <= ends + hold_s)
+        sides = np.maximum(first - 1, 0)
+        near = t[sides[0] : known[-1] + 1]
+        broken = np.concatenate(((0,), np.cumsum(near[1:] - near[:-1] >= GAP_S)))
+        told &= broken[known - sides[0]] == broken[sides - sides[0]]
+        inside = first[:, None] + np.arange(max(int((stop - first).max()), 0) + 2) - 1
+        past = inside >= stop[:, None]
+        at = np.clip(inside, 0, known[:, None])
+        times_s, values = t[at], self._values[at]
+        times_s[:, 0], values[:, 0] = starts, self._interpolated_at(starts, first)
+        times_s[past], values[past] = (
+            np.repeat(ends, past.sum(axis=1)),
+            np.repeat(self._interpolated_at(ends, stop), past.sum(axis=1), axis=0),
+        )
+        if self.shares.any():
+            values[..., :6] -= np.repeat(self.shares, 3) * values[..., 6:12]
+        begin, until = t.searchsorted(edges_s - SLOW_S), t.searchsorted(edges_s + min(0.1 * SLOW_S, hold_s))
+        oldest = int(begin[0])
+        summed = np.concatenate((np.zeros((1, 3)), np.cumsum(self._values[oldest : until[-1], 3:6], axis=0)))
+        slow = (summed[until - oldest] - summed[begin - oldest]) / np.maximum(until - begin, 1)[:, None]
+        return SampleSteps(times_s, values, np.stack((slow[:-1], slow[1:]), axis=1), told)
+
+    def _interpolated_at(self, times_s: Floats, after: NDArray[np.intp]) -> Floats:
+        """Give the values (N, 13) at times before the samples `after` (N,); beyond the samples, the nearest."""
+        after = np.clip(after, 1, self._count - 1)
+        before_s, after_s = self._t[after - 1], self._t[after]
+        share = np.clip((times_s - before_s) / (after_s - before_s), 0.0, 1.0)[:, None]
+        values: Floats = (1.0 - share) * self._values[after - 1] + share * self._values[after]
+        return values
 
     def _interpolated(self, time_s: float, after: int, last: int) -> Floats:
         """Give the values (13,) at a time before the sample `after`, of the first `last`; beyond them, the nearest."""

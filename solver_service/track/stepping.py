@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import math
 from dataclasses import replace
 from typing import Final
@@ -9,6 +10,7 @@ from typing import Final
 import numpy as np
 from buddyline.solver_service.geometry.rotation import rotation_exp
 from buddyline.solver_service.track import anchors
+from buddyline.solver_service.track.ahead import StepsAhead, steps_ahead
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.inputs import TrackNode
 from buddyline.solver_service.track.intake import newest_before
@@ -23,19 +25,29 @@ from buddyline.solver_service.track.state import (
     SHAKE,
     SIZE,
 )
+from buddyline.solver_service.track.strapdown import Increments
 from buddyline.solver_service.track.trail import Look, Step
 
+# So many steps are integrated together at most.
+MOST_TOGETHER: Final = 64
 # Longest step without a frame.
 TICK_S: Final = 0.1
 ATTITUDE_EVERY_S: Final = 0.5
 
 
 class TrackSteps(TrackSights):
-    """Brings estimates from picture to picture. keep_s: for how long their steps are kept."""
+    """Brings estimates from picture to picture. keep_s: for how long their steps are kept.
+
+    passes: whether this is a pass over a dive that is over, whose next pictures wait: their steps are then integrated
+    together, which moves the result by some thousandths of a sigma.
+    """
 
     def __init__(self, nodes: tuple[TrackNode, TrackNode], keep_s: float) -> None:
         super().__init__(nodes)
         self._keep_s = keep_s
+        self.passes = False
+        self._ahead: StepsAhead | None = None
+        self._together = 1
         self._ports = np.stack([node.rig.depth_port_m for node in nodes])
 
     def _step(self, estimate: Estimate, t_s: float, sight: Sight | None) -> None:
@@ -83,6 +95,31 @@ class TrackSteps(TrackSights):
             )
             if math.isinf(self._keep_s):
                 estimate.steps.pack()
+
+    def increments(self, estimate: Estimate, t_s: float) -> Increments:
+        """Integrate both nodes from the estimate's time to t_s; in a pass, together with later steps."""
+        if not (self.passes and estimate.confirmed) or any(estimate.without):
+            return super().increments(estimate, t_s)
+        step, ahead = (estimate.t_s, t_s), self._ahead
+        by_shares = estimate.learns and any(samples.parted for samples in self.samples)
+        if ahead is None or step not in ahead.at or ahead.by_shares != by_shares or not ahead.fits(estimate.state):
+            # Where the constants move, or other steps come than were expected, fewer are integrated together.
+            used_up = ahead is not None and not ahead.at
+            self._together = min(2 * self._together, MOST_TOGETHER) if used_up else max(self._together // 2, 1)
+            ahead = steps_ahead(self.samples, estimate.state, self._coming(step), HOLD_S, by_shares=by_shares)
+            self._ahead = ahead if step in ahead.at else None
+        at = ahead.at.pop(step, None)
+        return super().increments(estimate, t_s) if at is None else ahead.increments(estimate.state, at)
+
+    def _coming(self, step: tuple[float, float]) -> list[float]:
+        """Give a step's times, and those of the steps after it, by the pictures that wait."""
+        times_s = list(step)
+        for t_s, _, _, what in heapq.nsmallest(3 * self._together, self._events):
+            if isinstance(what, Sight) and t_s - times_s[-1] >= TOGETHER_S:
+                while t_s - times_s[-1] > 1.5 * TICK_S:
+                    times_s.append(times_s[-1] + TICK_S)
+                times_s.append(t_s)
+        return times_s[: self._together + 1]
 
     def _take_depth(self, estimate: Estimate, t_s: float) -> None:
         of_a, of_b = (newest_before(of_node, t_s) for of_node in self.depths)
