@@ -96,6 +96,8 @@ class Checked:
     waiting: dict[str, list[Undigested]] = field(default_factory=lambda: defaultdict(list))
     # By boot: the newest judged digest, without its sums.
     newest: dict[str, Digest] = field(default_factory=dict)
+    # By boot: the last stamp of each topic in that digest.
+    last_ns: dict[str, dict[str, int]] = field(default_factory=dict)
     # By boot: the numbers of the digests that are missing before that.
     absent: dict[str, set[int]] = field(default_factory=lambda: defaultdict(set))
     # Of what the node said then, by its clock, a digest is there: begins and ends, apart and in order.
@@ -210,6 +212,7 @@ class DigestCheck:
         _cover(of.covered, begin_ns, digest.stamp_ns + (0 if digest.last is UNSET else SAID_NS))
         if newest is None or digest.seq > newest.seq:
             of.newest[digest.boot] = replace(digest, said=[])
+            of.last_ns[digest.boot] = {stretch.topic: stretch.last_ns for stretch in digest.said}
         found = [one for stretch in digest.said for one in _compare(node, of, digest, stretch)]
         yield from found
         if not found:
@@ -220,10 +223,15 @@ class DigestCheck:
         """Name the messages that no digest has named, by second."""
         if not of.newest:
             return  # the whole node is not signed
-        # What a run said after the last digest that is there, also where the clock was set back before the next run.
-        ends_ns = [digest.stamp_ns for digest in of.newest.values() if digest.last is UNSET]
+        # What a run said after the last digest that is there, also where the clock was set back before the next run. On
+        # a busy machine it may be older than SAID_NS then: its stamp comes after those of its topic in that digest.
+        rests_ns = [
+            (min(digest.stamp_ns - SAID_NS, of.last_ns[boot].get(topic, digest.stamp_ns)), digest.stamp_ns)
+            for boot, digest in of.newest.items()
+            if digest.last is UNSET
+        ]
         # All digests are there, and no other run is.
-        is_whole = self._own and not ends_ns and not any(of.absent.values())
+        is_whole = self._own and not rests_ns and not any(of.absent.values())
         seconds: dict[tuple[int, Kind], int] = defaultdict(int)
         for one in left:
             # A forgery is only what would have to be in a digest that is there.
@@ -232,7 +240,7 @@ class DigestCheck:
                 altered = altered and _in_digests(of, max(one.stamp_ns, one.time_ns - SAID_NS), one.time_ns)
             # What came after its digest was judged belongs to what was missing then, and is as little verified.
             altered = altered and not any(first <= one.stamp_ns <= last for first, last in of.incomplete[topic])
-            altered = altered and not any(-SAID_NS <= one.stamp_ns - end_ns <= MOST_DIGEST_NS for end_ns in ends_ns)
+            altered = altered and not any(after < one.stamp_ns <= end + MOST_DIGEST_NS for after, end in rests_ns)
             seconds[one.time_ns // S_NS, "altered" if altered or is_whole else "unsigned"] += 1
         for (second, kind), count in sorted(seconds.items()):
             at_ns = second * S_NS

@@ -301,6 +301,23 @@ def test_a_run_that_began_just_before_a_recording_ended_is_no_forgery(keys: Path
     assert kinds(findings([*written("a", keys), *begun], keys, own=False)) == {"unsigned"}
 
 
+@pytest.mark.parametrize(("late_ns", "kind"), [(1, "unsigned"), (0, "altered")])
+def test_late_samples_after_a_recordings_last_digest_are_no_forgery(late_ns: int, kind: str) -> None:
+    """The node says what it measured 1.3 s ago; the recording has no digest of the last sample."""
+    book, lines, said_ns = DigestBook("a", "x", BEGAN_NS), [], BEGAN_NS
+    for k in range(20):
+        said_ns = BEGAN_NS + k * S_NS // 10
+        depth = Depth(node="a", stamp_ns=said_ns - 13 * S_NS // 10, depth_m=float(k), sigma_m=0.1)
+        book.add(topic_of(depth), depth.stamp_ns, encode(depth))
+        lines.append((key_of(depth), encode(depth), said_ns))
+        if k % 10 == 9:
+            digest = book.digest(said_ns)
+            lines.append((key_of(digest), sealed(digest, None), said_ns))
+    rest = Depth(node="a", stamp_ns=depth.stamp_ns + late_ns, depth_m=7.0, sigma_m=0.1)
+    found = findings([*lines, (key_of(rest), encode(rest), said_ns + 1)], None, own=False)
+    assert [one.kind for one in found if "no digest" in one.words] == [kind]
+
+
 def test_a_clock_that_is_set_back_while_a_node_is_down_makes_no_forgery(keys: Path) -> None:
     killed = written("a", keys, ended=False)[:-5]
     again = written("a", keys, "y", BEGAN_NS - 3 * S_NS // 2)
