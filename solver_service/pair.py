@@ -149,7 +149,7 @@ class PairSolver:
         if may_rest and rests:
             return NoFix("too_few_candidates", may_rest)
         if self.hurried and one.trigger % (LOOKS * LOOKS if rests else LOOKS):
-            return NoFix("overload", NO_TIME)
+            return NoFix("unmatched", NO_TIME)
         return None
 
     def _may_rest(self, one: Matched) -> str:

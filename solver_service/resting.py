@@ -26,7 +26,7 @@ CROWD: Final = 5
 # The details of the triggers that are not solved; their reason is `too_few_candidates`.
 LOOK_APART: Final = "by both attitudes the cameras look apart"
 NOT_IN_VIEW: Final = "one of many pairs, which had no pose for 5 s"
-# Of those that are left out for want of time; their reason is `overload`.
+# Of those that are left out for want of time; their reason is `unmatched`.
 NO_TIME: Final = (
     "this solver cannot keep up: until it does, it solves one in five triggers, where a pair rests one in 25"
 )

@@ -31,7 +31,6 @@ Reason: TypeAlias = Literal[
     "duplicate",
     "heading",
     "other_lights",
-    "overload",
 ]
 TrackMode: TypeAlias = Literal["filter", "lag", "smooth"]
 

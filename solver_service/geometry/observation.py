@@ -13,6 +13,7 @@ from buddyline.solver_service.geometry.se3 import SE3
 
 Method: TypeAlias = Literal["refined", "exact", "paper", "paper_midpoint", "paper_literal"]
 Reason: TypeAlias = Literal[
+    "unmatched",
     "too_few_candidates",
     "range_gap",
     "twist_gap",
@@ -20,7 +21,6 @@ Reason: TypeAlias = Literal[
     "depth",
     "heading",
     "other_lights",
-    "overload",
     "out_of_range",
     "ambiguous",
     "degenerate",

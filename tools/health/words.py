@@ -45,10 +45,6 @@ REASONS: Final[dict[str, tuple[str, str]]] = {
     "degenerate": ("the nodes stand so that no pose follows", "move one node a little aside or turn it"),
     "late": ("candidates came too late", "check the link's load and the clocks"),
     "duplicate": ("candidates came twice", "make sure that no two nodes have the same id"),
-    "overload": (
-        "the solver cannot keep up",
-        "start another one on another machine (`buddyline solver --share`), or lower the nodes' rate",
-    ),
 }
 
 # What a node has lowered to save power or to cool down, by its status's `load`.

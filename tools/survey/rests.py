@@ -28,7 +28,7 @@ LEAST_RUN: Final = 3
 FEEL_NS: Final = 500_000_000
 GRAVITY_MPS2: Final = 9.80665
 # Reasons that mean that a node looked away, that the link lost a frame, or that the solver had no time.
-UNSEEN: Final = ("unmatched", "no_info", "too_few_candidates", "late", "duplicate", "overload")
+UNSEEN: Final = ("unmatched", "no_info", "too_few_candidates", "late", "duplicate")
 
 
 @dataclass(frozen=True, eq=False)
