@@ -135,6 +135,8 @@ def setup_pi(system: Debian) -> None:
     config = "sed -i s,tls/192.168.2.1,tls/127.0.0.1, ~/a.toml"
     system.run(
         "echo 'deb [trusted=yes] file:/stand-ins ./' > /etc/apt/sources.list.d/stand-ins.list; apt-get update;"
+        # One of an earlier run would stay, though today's has the same version.
+        "apt-get purge -y python3-picamera2 || true;"
         "apt-get install -y --no-install-recommends systemd polkitd; id diver || useradd --create-home diver;"
         "mkdir -p /boot/firmware; echo dtparam=audio=on > /boot/firmware/config.txt;"
         "rm -rf /home/diver/*; git config --system --add safe.directory /src.git"
