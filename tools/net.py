@@ -137,17 +137,6 @@ def find(paths: Sequence[str], still: Sequence[str], net: str) -> dict[str, Stan
     return stands
 
 
-def load_place(path: str) -> FixedPlace:
-    """Read the lines that `net init` wrote; raise ConfigError naming file, field and value."""
-    from buddyline.node.config import PlaceConfig
-    from buddyline.protocol.config import ConfigError, load_config
-
-    try:
-        return load_config(path, PlaceConfig).fixed.place
-    except ValueError as error:
-        raise ConfigError(f"{path}: fixed.{error}") from error
-
-
 def _check_still(node: str, R_ned_body: NDArray[np.float64]) -> None:
     """Raise BuddylineError where a node's own attitudes (N, 3, 3) say that it did not stand still."""
     import numpy as np

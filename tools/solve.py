@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Final
 
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.config import ConfigError
+from buddyline.protocol.config import ConfigError, load_config
 from buddyline.protocol.divelog import DiveLogWriter
 from buddyline.protocol.envelope import Envelope
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.messages import CompressedImage, Message, NodeInfo, NodePose, Track
+from buddyline.protocol.messages import CompressedImage, FixedPlace, Message, NodeInfo, NodePose, Track
 from buddyline.protocol.topics import TRACK
 from buddyline.solver_service.config import SolveConfig, node_ids, track_settings
 from buddyline.solver_service.core import SolverCore
@@ -26,7 +26,6 @@ from buddyline.solver_service.pair_core import PairCore
 from buddyline.tools.authenticity import AUTHENTICITY, check_logs
 from buddyline.tools.clock_curves import chosen_curves
 from buddyline.tools.dives import Dive, load_info
-from buddyline.tools.net import load_place
 from buddyline.tools.newfile import new_dive_log
 from buddyline.tools.option_values import node_files
 from msgspec import UNSET
@@ -137,8 +136,18 @@ def placed(given: list[str], infos: Mapping[str, NodeInfo]) -> dict[str, NodeInf
             raise ConfigError(f"--place {node}={path}: no NodeInfo of node {node}; nodes: {', '.join(sorted(infos))}")
         if node in found:
             raise ConfigError(f"--place {node}={path}: node {node} has a place already")
-        found[node] = replace(infos[node], fixed=load_place(path))
+        found[node] = replace(infos[node], fixed=_load_place(path))
     return found
+
+
+def _load_place(path: str) -> FixedPlace:
+    """Read the lines that `net init` wrote; raise ConfigError naming file, field and value."""
+    from buddyline.node.config import PlaceConfig
+
+    try:
+        return load_config(path, PlaceConfig).fixed.place
+    except ValueError as error:
+        raise ConfigError(f"{path}: fixed.{error}") from error
 
 
 def nodes_of(dive: Dive, given: list[str] | None) -> list[str]:

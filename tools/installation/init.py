@@ -37,7 +37,8 @@ connect = "tcp/127.0.0.1:7447"    # <- the hub
 # namespace = ""                  # as the hub has it
 # status_file = ""                # its health report; default: in the runtime directory
 # journal = ""                    # what it has answered, so that it answers nothing twice; default: likewise
-# share = false                 # true: all solvers on this hub that are started so divide the pairs among them
+# lights = ["c.json"]             # NodeInfo of tripods and buoys of lamps alone, which run no program
+# share = false                   # true: all solvers on this hub that are started so divide the pairs among them
 
 [solve]
 method = "refined"
