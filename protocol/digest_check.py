@@ -41,6 +41,8 @@ MAX_COVERED: Final = 1024
 SAID_NS: Final = S_NS
 # These are said again when the bus connects, however old.
 SAID_AGAIN: Final = {end_of(topic) for topic in TOPICS if topic.latest_only and is_covered(topic)}
+# These are said once each, in the order of their stamps.
+SAMPLED: Final = {end_of(topic) for topic in TOPICS if not topic.latest_only and is_covered(topic)}
 # Digests of a node that may come late: a day's.
 MAX_ABSENT: Final = 86_400
 
@@ -96,7 +98,7 @@ class Checked:
     waiting: dict[str, list[Undigested]] = field(default_factory=lambda: defaultdict(list))
     # By boot: the newest judged digest, without its sums.
     newest: dict[str, Digest] = field(default_factory=dict)
-    # By boot: the last stamp of each topic in that digest.
+    # By boot: the last stamp of each topic of SAMPLED in that digest.
     last_ns: dict[str, dict[str, int]] = field(default_factory=dict)
     # By boot: the numbers of the digests that are missing before that.
     absent: dict[str, set[int]] = field(default_factory=lambda: defaultdict(set))
@@ -212,7 +214,8 @@ class DigestCheck:
         _cover(of.covered, begin_ns, digest.stamp_ns + (0 if digest.last is UNSET else SAID_NS))
         if newest is None or digest.seq > newest.seq:
             of.newest[digest.boot] = replace(digest, said=[])
-            of.last_ns[digest.boot] = {stretch.topic: stretch.last_ns for stretch in digest.said}
+            lasts_ns = {one.topic: one.last_ns for one in digest.said if one.topic in SAMPLED}
+            of.last_ns[digest.boot] = {name: max(ns, digest.stamp_ns - LATE_NS) for name, ns in lasts_ns.items()}
         found = [one for stretch in digest.said for one in _compare(node, of, digest, stretch)]
         yield from found
         if not found:

@@ -318,6 +318,23 @@ def test_late_samples_after_a_recordings_last_digest_are_no_forgery(late_ns: int
     assert [one.kind for one in found if "no digest" in one.words] == [kind]
 
 
+def test_a_calibration_said_again_excuses_no_forged_one() -> None:
+    """The newest digest has the first calibration again, with its old stamp; the last digest is missing."""
+    book, lines, now_ns = DigestBook("a", "x", BEGAN_NS), [], BEGAN_NS
+    told = info(node="a", stamp_ns=BEGAN_NS)
+    for k in range(20):
+        now_ns = BEGAN_NS + k * S_NS
+        for message in [told] * (k in (0, 19)) + said("a", now_ns, float(k)):
+            book.add(topic_of(message), message.stamp_ns, encode(message))
+            lines.append((key_of(message), encode(message), now_ns))
+        digest = book.digest(now_ns + S_NS // 2)
+        lines.append((key_of(digest), sealed(digest, None), now_ns + S_NS // 2))
+    forged = info(node="a", stamp_ns=BEGAN_NS + 10 * S_NS)
+    lines.insert(len(lines) // 2, (key_of(forged), encode(forged), forged.stamp_ns))
+    found = findings(lines, None, own=False)
+    assert [one.kind for one in found if one.words.startswith("info")] == ["altered"]
+
+
 def test_a_clock_that_is_set_back_while_a_node_is_down_makes_no_forgery(keys: Path) -> None:
     killed = written("a", keys, ended=False)[:-5]
     again = written("a", keys, "y", BEGAN_NS - 3 * S_NS // 2)
