@@ -30,6 +30,8 @@ QUERY_S: Final = 2.0
 # others wait: a link that lost a moment of a solver's outcomes lost those of many pairs.
 MAX_OWNER_GAPS: Final = 8
 MAX_GAPS: Final = 64
+# Of an owner wait at most as many: 16 nodes form 120 pairs, each with four topics or fewer that are fetched.
+MAX_OWNER_WAITING: Final = 512
 # Queries for one gap.
 FETCHES: Final = 16
 # Pages of an answer that may wait: more than all that a publisher holds.
@@ -200,9 +202,11 @@ class ZenohSubscription:
 
     def _start_filling(self, gap: Gap | None) -> None:
         """Fetch a gap in a thread of its own, or once another of its owner is filled; the lock is held."""
-        # There is no more than one of each publisher, whose number is limited.
-        # By owner: a client that invents publishers with gaps takes no thread from another's.
-        while gap is not None and len(self._fetching) >= MAX_GAPS:
+        # By owner: a client that invents publishers with gaps takes no thread and no memory from another's.
+        waiting = [one.source.owner for one in self._unfilled]
+        while gap is not None and (
+            len(self._fetching) >= MAX_GAPS or waiting.count(gap.source.owner) >= MAX_OWNER_WAITING
+        ):
             gap = self._sequence.close(gap, [])
         if gap is not None and list(self._fetching.values()).count(gap.source.owner) >= MAX_OWNER_GAPS:
             self._unfilled.append(gap)
