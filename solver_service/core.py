@@ -30,6 +30,7 @@ from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.health import Health
 from buddyline.solver_service.networking import NetTracker
 from buddyline.solver_service.pair_core import PairCore, PairId, newer
+from buddyline.solver_service.resting import CROWD
 from buddyline.solver_service.sensors import KEPT_NS
 from buddyline.solver_service.streams import Arrival, NodeStream
 from buddyline.solver_service.track.problems import present
@@ -129,7 +130,8 @@ class SolverCore:
         for message in messages:
             for pair in self._take(message, now_ns, receive_ns):
                 touched[pair.nodes] = pair
-        return self._settled(touched.values())
+        # One may have been let go since: a later message said that a node of it has a camera or lamps alone.
+        return self._settled([pair for nodes, pair in touched.items() if self.pairs.get(nodes) is pair])
 
     def advance(self, receive_ns: int) -> list[Message]:
         """Advance the receive time; return the outcomes whose waiting time is over."""
@@ -172,6 +174,10 @@ class SolverCore:
     def net_poses(self) -> list[tuple[str, str]]:
         """The net and the node of each NodePose that may come."""
         return [(self.network.net, node) for node in self.network.nodes] if self.network is not None else []
+
+    def is_single(self, node: str) -> bool:
+        """Whether a node has a camera or lamps alone, and so is in no pair."""
+        return node in self._single
 
     def pairs_of(self, node: str) -> list[PairId]:
         """Return the pairs that a node is in."""
@@ -227,8 +233,9 @@ class SolverCore:
 
     def _settled(self, pairs: Iterable[PairCore], told_ns: int = -1) -> list[Message]:
         messages: list[Message] = []
+        crowded = len(self.streams) - len(self._single) >= CROWD
         for pair in pairs:
-            pair.crowd(len(self.streams), hurried=self.hurried)
+            pair.crowd(alone=len(self.streams) == 2, crowded=crowded, hurried=self.hurried)
             messages += pair.settle(told_ns)
         if self.network is None:
             return messages
@@ -259,6 +266,8 @@ class SolverCore:
                 for nodes in self.pairs_of(stream.node):
                     self.release(nodes)
                 self._pairs_of.pop(stream.node, None)
+        elif isinstance(message, NodeInfo):
+            self._single.discard(stream.node)
         formed = self._chosen is not None or stream.node in self._pairs_of or stream.node in self._single
         if isinstance(message, NodeInfo | Candidates) and not formed:
             self._form_pairs(stream, now_ns)

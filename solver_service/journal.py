@@ -40,7 +40,7 @@ class Noted:
     """What earlier solvers at this hub have received and said.
 
     said: answers, in their order. recent: key and payload, as they were published, of the outcomes of the last minute;
-    of a solver that was behind, and wrote in the last minute, those of the minute before its newest. frames: node,
+    of a file that was written to in the last minute, those of the minute before its pairs' newest. frames: node,
     trigger and stamp of the frames of this dive.
     """
 

@@ -21,7 +21,6 @@ from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix
 from buddyline.solver_service.geometry.trigger import NoFix, Settings
 from buddyline.solver_service.matcher import PairMatcher, Unmatched
 from buddyline.solver_service.pair import Matched, PairSolver
-from buddyline.solver_service.resting import CROWD
 from buddyline.solver_service.results import relative_pose
 from buddyline.solver_service.sensors import attitude_at
 from buddyline.solver_service.streams import Arrival, NodeStream
@@ -81,9 +80,9 @@ class PairCore:
         self._settled: list[Message] = []
         self._advised: list[str] = []
 
-    def crowd(self, nodes: int, *, hurried: bool) -> None:
-        """Note how many nodes there are, for this pair may be one of many; hurried: whether the solver is behind."""
-        self._alone, crowded = nodes == 2, nodes >= CROWD
+    def crowd(self, *, alone: bool, crowded: bool, hurried: bool) -> None:
+        """Note whether this pair is the only one, or one of many; hurried: whether the solver is behind."""
+        self._alone = alone
         self.solver.crowded, self.solver.hurried = crowded, crowded and hurried
         if self.tracker is not None:
             self.tracker.crowded = crowded

@@ -164,8 +164,13 @@ class SolverService(Service):
                     self.heartbeat()
                 self.tick(status_due)
             if self._work is None or self._work.sharing.alone:
-                with self._lock:
-                    self._publish(self.core.flush())
+                self.finish()
+
+    def finish(self) -> None:
+        """Handle what still waits, and resolve all pending triggers."""
+        with self._lock:
+            self._take_all()
+            self._publish(self.core.flush())
 
     def tick(self, status_due: bool) -> None:
         """Resolve triggers whose time has come; report where a status is due, or the words of one have changed.
@@ -287,8 +292,8 @@ class SolverService(Service):
     def receive(self, received: Received) -> None:
         """Take one message from the bus; a bad one is counted and reported. At the end a backlog is left to the next.
 
-        The end would else wait for the lock, for as long as the backlog lasts. Where messages wait, a solver that
-        cannot keep up gathers them.
+        The end would else wait for the lock, for as long as the backlog lasts. Where more messages wait, they are
+        gathered.
         """
         if self.stop.is_set():
             return
@@ -323,7 +328,8 @@ class SolverService(Service):
             refused, self._refused = self._refused, ""
             self._news = False
             flood = self._bus.flood_problem() if self._bus is not None else ""
-            slow = f"the solver is {self._behind_ns / S_NS:.0f} s behind: too much for this machine"
+            slow = f"the solver is {self._behind_ns / S_NS:.0f} s behind: too much for this machine; start another one"
+            slow += " elsewhere, all with --share"
             problems = [one for one in (refused, flood, slow * (self._behind_ns > BEHIND_NS)) if one]
             problems += self._work.problems if self._work is not None else []
             statuses = self.core.report(now_ns, now_ns, self.refusals.count, problems)
@@ -344,6 +350,7 @@ class SolverService(Service):
         """Handle what has come, except frames from a cache that an earlier solver has answered."""
         came, self._came = self._came, []
         together: list[Message] = []
+        waited_ns: list[int] = []
         for message, receive_ns in came:
             if not isinstance(message, Candidates):
                 together.append(message)
@@ -351,8 +358,7 @@ class SolverService(Service):
             new = self._joined_ns is not None and receive_ns > self._joined_ns
             # What a link or a cache has held for long says nothing of this solver's speed.
             if abs(receive_ns - message.stamp_ns) < BEHIND_NS:
-                self._behind_ns = max(self.clock.now_ns() - receive_ns, 0)
-                self.core.hurried = self._behind_ns > BEHIND_NS
+                waited_ns.append(max(self.clock.now_ns() - receive_ns, 0))
             pairs = self.core.pairs_of(message.node)
             if new:
                 # All later frames are new too, even if the clock is set.
@@ -367,6 +373,10 @@ class SolverService(Service):
                     self._handle(together)
                     together, pairs = [], self.core.pairs_of(message.node)
                 self._publish(self._answered.saw_new_frame(pairs, message.trigger, message.stamp_ns))
+        if waited_ns:
+            # A sender of too much is served last: what waits least shows how far behind the solver is.
+            self._behind_ns = min(waited_ns)
+            self.core.hurried = self._behind_ns > BEHIND_NS
         self._handle(together)
         self._handled += len(came)
 
@@ -446,7 +456,7 @@ class SolverService(Service):
         owed = {
             (pair, trigger): stamp_ns
             for (pair, trigger), stamp_ns in self._owed.items()
-            if not any((node, trigger) in self._come_again for node in pair)
+            if not any((node, trigger) in self._come_again or self.core.is_single(node) for node in pair)
         }
         detail = "its frames were lost with the solver and node that had them"
         outcomes = [

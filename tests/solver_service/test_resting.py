@@ -16,7 +16,7 @@ from buddyline.node.sim.trajectory import Placement
 from buddyline.node.sim.world import World
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Attitude, Candidates, Depth, Message, NodeInfo, Rejected, RelativePose
-from buddyline.solver_service import pair_core
+from buddyline.solver_service import core
 from buddyline.solver_service.config import SolveConfig
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.fix import NoFix
@@ -165,7 +165,7 @@ def test_in_a_crowd_of_another_shape_no_pair_in_view_is_lost(
     sent = (one for _, _, one in simulation.messages(world, plan))
     told = [one for one in sent if isinstance(one, NodeInfo | Candidates | Attitude | Depth)]
     rested = outcomes(told, 5000)
-    monkeypatch.setattr(pair_core, "CROWD", 99)
+    monkeypatch.setattr(core, "CROWD", 99)
     awake = outcomes(told, 5000)
 
     def in_view(a: str, b: str, trigger: int) -> bool:

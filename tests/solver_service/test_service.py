@@ -108,6 +108,40 @@ def test_messages_that_wait_are_solved_together_and_give_the_same(dive, monkeypa
     assert len(said[0]) > 20
 
 
+def test_what_waits_when_the_solver_ends_is_solved(dive, monkeypatch):
+    monkeypatch.setattr(service_module, "GATHER_S", 1e9)
+    bus, clock = Capture(), ManualClock()
+    service = SolverService(SolverConfig(nodes=["a", "b"]), clock=clock)
+    service.attach(bus)
+    service._subscription = SimpleNamespace(waiting=1)
+    for message in dive[0][:200]:
+        clock.set_ns(message.stamp_ns)
+        take(service, message)
+    assert service._came
+    service.finish()
+    triggers = {m.trigger for m in dive[0][:200] if isinstance(m, Candidates)}
+    assert {one.trigger for one in outcomes_of(bus)} == triggers
+
+
+def test_a_node_without_lamps_whose_frames_came_first_ends_no_solver(dive, monkeypatch):
+    """Frames of a and b form a pair; what says that b has a camera alone waits behind them."""
+    monkeypatch.setattr(service_module, "GATHER_S", 1e9)
+    bus, clock = Capture(), ManualClock()
+    service = SolverService(SolverConfig(), clock=clock)
+    service.attach(bus)
+    service._subscription = SimpleNamespace(waiting=1)
+    infos = {m.node: m for m in dive[0] if isinstance(m, NodeInfo)}
+    frames = [m for m in dive[0] if isinstance(m, Candidates)]
+    for message in [infos["a"], *frames, replace(infos["b"], role="camera")]:
+        clock.set_ns(frames[-1].stamp_ns)
+        take(service, message)
+    service._subscription.waiting = 0
+    service.tick(status_due=True)
+    assert not service.core.pairs
+    take(service, infos["b"])
+    assert list(service.core.pairs) == [("a", "b")], "a node that has lamps after all"
+
+
 @pytest.mark.parametrize("nodes", [2, CROWD])
 def test_a_solver_that_cannot_keep_up_says_so_and_in_a_crowd_solves_less(dive, nodes, monkeypatch):
     """The frames of each node wait for four seconds in it, until the queue is empty."""

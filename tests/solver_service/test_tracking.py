@@ -7,7 +7,7 @@ import pytest
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Candidates, Depth, Imu, NodeInfo, Rejected, RelativePose, Track
 from buddyline.protocol.topics import TRACK, TRACK_LAG, key_of
-from buddyline.solver_service import pair_core, tracking
+from buddyline.solver_service import core, tracking
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.streams import NodeStream
@@ -257,7 +257,7 @@ def test_a_changed_calibration_ends_one_track_and_begins_another(inertial_dive):
 
 
 def test_a_track_of_one_of_many_pairs_begins_with_the_pose_after_a_rest(inertial_dive, monkeypatch):
-    monkeypatch.setattr(pair_core, "CROWD", 2)
+    monkeypatch.setattr(core, "CROWD", 2)
     messages = [m for m in inertial_dive[0] if m.stamp_ns < inertial_dive[0][0].stamp_ns + 9 * S_NS]
     start_ns = messages[0].stamp_ns + 6 * S_NS
     blind = [replace(m, blobs=[]) if isinstance(m, Candidates) and m.stamp_ns < start_ns else m for m in messages]

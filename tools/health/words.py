@@ -14,7 +14,7 @@ from msgspec import UNSET
 # Each rejection reason of the protocol: what it means, and what may help.
 REASONS: Final[dict[str, tuple[str, str]]] = {
     "unmatched": (
-        "the other node has no picture of that instant",
+        "the other node has no picture of that instant, or the solver is behind",
         "check that both nodes run, at one rate, with clocks in step",
     ),
     "no_info": ("a node's calibration is not known", "restart that node, or give the solver its calibration"),
