@@ -104,6 +104,8 @@ def run(args: argparse.Namespace) -> int:
     state = Answers(SystemClock().now_ns)
     bridge = Bridge(args, kinds, state)
     api = HttpApi(*host_and_port("--http", args.http), state) if args.http else None
+    # Before the line that says that it is there: whoever waits for it may end it.
+    client.handle_signals()
     if api is not None:
         log.info("bridge: http://%s:%d/api/v1/position/acoustic/filtered", args.http.rpartition(":")[0], api.port)
 
