@@ -42,6 +42,30 @@ def answer_of(outcome: Outcome) -> Answer:
     return Answer(outcome.node_a, outcome.node_b, outcome.trigger, outcome.stamp_ns, reason)
 
 
+def said_of(held: Iterable[Answer], noted: Iterable[Answer]) -> list[Answer]:
+    """Return each pair's last outcomes by the journal, or as the hub holds them if the journal does not know those."""
+    by_journal, by_hub = by_pair(noted), by_pair(held)
+    said: list[Answer] = []
+    for pair in {**by_journal, **by_hub}:
+        of_journal, of_hub = by_journal.get(pair, []), by_hub.get(pair, [])
+        known = {(one.trigger, one.stamp_ns) for one in of_journal}
+        if of_hub and not any((one.trigger, one.stamp_ns) in known for one in of_hub):
+            said += of_hub
+        else:
+            # What the journal has beyond the hub was published too, and is published again.
+            said += [one for one in of_journal if one.in_order][-1:]
+            said += [one for one in of_journal if not one.in_order]
+    return said
+
+
+def by_pair(outcomes: Iterable[Answer]) -> dict[tuple[str, str], list[Answer]]:
+    """Return outcomes by their pairs, in their order."""
+    found: dict[tuple[str, str], list[Answer]] = {}
+    for one in outcomes:
+        found.setdefault((one.node_a, one.node_b), []).append(one)
+    return found
+
+
 class Answered:
     """Withholds outcomes that were published before, for all pairs. said: the last published outcomes of each pair."""
 

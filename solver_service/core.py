@@ -29,12 +29,13 @@ from buddyline.solver_service.clock_curve import ClockCurve
 from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.health import Health
 from buddyline.solver_service.networking import NetTracker
+from buddyline.solver_service.pace import Pace
 from buddyline.solver_service.pair_core import PairCore, PairId, newer
 from buddyline.solver_service.resting import CROWD
 from buddyline.solver_service.sensors import KEPT_NS
 from buddyline.solver_service.streams import Arrival, NodeStream
 from buddyline.solver_service.track.problems import present
-from buddyline.solver_service.tracking import TrackSettings
+from buddyline.solver_service.tracking import TrackSettings, work_out_together
 from msgspec import UNSET
 from msgspec.structs import replace
 
@@ -55,7 +56,7 @@ class SolverCore:
     node's clock minus the common clock, where known; the node's stamps are moved to the common clock. align: estimate
     the clock offset of each pair. track: the tracks to make; None for no track, and no network. lone: nodes of the
     network beside those of the chosen pairs. network: follows all nodes in one frame; None without `track`. unused:
-    number of messages of each node that is not used. hurried: of many pairs, solve one in five triggers. shared: other
+    number of messages of each node that is not used. pace: what is left out where it cannot keep up. shared: other
     cores have some of the pairs, and perhaps the network: this one begins with none, and gets its own by `adopt` and
     `adopt_network`.
     """
@@ -76,7 +77,7 @@ class SolverCore:
         self.pairs: dict[PairId, PairCore] = {}
         self.health = Health()
         self.unused: Counter[str] = Counter()
-        self.hurried = False
+        self.pace = Pace()
         self._chosen = chosen
         self._clocks = clocks or {}
         self._align = align
@@ -121,15 +122,23 @@ class SolverCore:
 
         receive_ns: receive time; None when read from a log.
         """
-        return self._settled(self._take(message, self._steady(receive_ns), receive_ns))
+        return self.handle_many((message,), receive_ns)
 
     def handle_many(self, messages: Iterable[Message], receive_ns: int | None = None) -> list[Message]:
-        """Take several messages, as if one by one; their matched triggers are solved together."""
+        """Take several messages; their matched triggers are solved together.
+
+        Read from a log they are matched as if one by one, live as if they had come at one moment.
+        """
         now_ns = self._steady(receive_ns)
         touched: dict[PairId, PairCore] = {}
         for message in messages:
             for pair in self._take(message, now_ns, receive_ns):
                 touched[pair.nodes] = pair
+                if now_ns is None:
+                    pair.resolve(now_ns)
+        if now_ns is not None:
+            for pair in touched.values():
+                pair.resolve(now_ns)
         # One may have been let go since: a later message said that a node of it has a camera or lamps alone.
         return self._settled([pair for nodes, pair in touched.items() if self.pairs.get(nodes) is pair])
 
@@ -174,6 +183,18 @@ class SolverCore:
     def net_poses(self) -> list[tuple[str, str]]:
         """The net and the node of each NodePose that may come."""
         return [(self.network.net, node) for node in self.network.nodes] if self.network is not None else []
+
+    @property
+    def is_crowded(self) -> bool:
+        """Whether there are so many nodes that pairs rest."""
+        return len(self.streams) - len(self._single) >= CROWD
+
+    def keep_up(self, behind_ns: int, receive_ns: int) -> None:
+        """Take how long frames of now have waited for this core: in a crowd, leave out what there is no time for."""
+        tracks = [pair.tracker for _, pair in sorted(self.pairs.items()) if pair.tracker and pair.tracker.follows]
+        network = [self.network] if self.network is not None and self.network.follows else []
+        now_ns = self._steady(receive_ns) or 0
+        self.pace.take(behind_ns if self.is_crowded else 0, now_ns, tracks or network)
 
     def is_single(self, node: str) -> bool:
         """Whether a node has a camera or lamps alone, and so is in no pair."""
@@ -233,12 +254,16 @@ class SolverCore:
 
     def _settled(self, pairs: Iterable[PairCore], told_ns: int = -1) -> list[Message]:
         messages: list[Message] = []
-        crowded = len(self.streams) - len(self._single) >= CROWD
+        crowded, settled = self.is_crowded, []
         for pair in pairs:
-            pair.crowd(alone=len(self.streams) == 2, crowded=crowded, hurried=self.hurried)
-            messages += pair.settle(told_ns)
+            pair.crowd(alone=len(self.streams) == 2, crowded=crowded, one_in=self.pace.one_in)
+            settled.append((pair, pair.follow(told_ns)))
+        work_out_together([one.track for _, one in settled])
+        for pair, one in settled:
+            messages += pair.told(one)
         if self.network is None:
             return messages
+        self.network.one_in = self.pace.one_in
         return messages + self.network.take(newer(messages, told_ns))
 
     def _steady(self, receive_ns: int | None) -> int | None:
@@ -296,10 +321,7 @@ class SolverCore:
                     self._note_late(sample)
         if isinstance(message, Imu | ImuMeans):
             return ()  # No trigger waits for inertial samples.
-        pairs = self._pairs_of.get(stream.node, ())
-        for pair in pairs:
-            pair.resolve(now_ns)
-        return pairs
+        return self._pairs_of.get(stream.node, ())
 
     def _note_late(self, sample: Imu) -> None:
         for pair in self._pairs_of.get(sample.node, ()):

@@ -16,6 +16,7 @@ from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_m
 from buddyline.solver_service.network.belief import KnownPlace
 from buddyline.solver_service.network.estimate import NetRow
 from buddyline.solver_service.network.filter import NetFilter
+from buddyline.solver_service.pace import NO_NETWORK
 from buddyline.solver_service.results import NUMERIC_ERRORS, view_of
 from buddyline.solver_service.streams import STOPPED_NS, NodeStream
 from buddyline.solver_service.track.inputs import DepthSeen
@@ -29,7 +30,10 @@ MOST_HZ: Final = 20.0
 
 
 class NetTracker:
-    """Follows all nodes in one frame. streams: by node; nodes may be added to it later."""
+    """Follows all nodes in one frame.
+
+    streams: by node; nodes may be added to it later. one_in: of so many triggers and rows one is taken.
+    """
 
     def __init__(self, streams: Mapping[str, NodeStream], settings: TrackSettings) -> None:
         self._streams = streams
@@ -38,6 +42,7 @@ class NetTracker:
         self._past: list[str] = []
         self._left: list[Message] = []
         self._filter: NetFilter | None = None
+        self.one_in, self._stopped = 1, False
         self.forget()
 
     def forget(self) -> None:
@@ -54,6 +59,20 @@ class NetTracker:
         self._taken_ns = self._told_ns = -1
         self.net = NET
         self._zero_m = np.zeros(3)
+
+    def stop(self) -> None:
+        """End, and take nothing up to `go_on`."""
+        self.forget()
+        self._stopped = True
+
+    def go_on(self) -> None:
+        """Begin anew with what comes."""
+        self._stopped = False
+
+    @property
+    def follows(self) -> bool:
+        """Whether there is an estimate."""
+        return self._filter is not None
 
     @property
     def nodes(self) -> list[str]:
@@ -75,13 +94,14 @@ class NetTracker:
     def problems(self) -> list[str]:
         """What is wrong, and what was (it says so)."""
         found = self._filter.problems if self._filter is not None else []
+        found = [*found, NO_NETWORK] if self._stopped else found
         return self._past + [problem for problem in found if problem not in self._past]
 
     def take(self, outcomes: Iterable[Message]) -> list[Message]:
         """Go on to where these outcomes allow; return the poses of all nodes up to there."""
         outcomes, fixes = list(outcomes), []
-        if not outcomes:
-            return []
+        if not outcomes or self._stopped:
+            return self._told([])
         for one in outcomes:
             # A late frame's stamp is old, or far from the dive's time: it does not carry the network on.
             if isinstance(one, RelativePose) or (isinstance(one, Rejected) and one.reason != "late"):
@@ -149,7 +169,7 @@ class NetTracker:
         told_ns = min(to_ns, max(self._settled_ns.values(), default=to_ns))
         due = range(-(-(self._told_ns + 1) // self._period_ns), told_ns // self._period_ns + 1)
         self._taken_ns, self._told_ns = to_ns, told_ns
-        rows = track.advance(to_ns, [k * self._period_ns for k in due])
+        rows = track.advance(to_ns, [k * self._period_ns for k in due if not k % self.one_in])
         return self._told([self._message(row) for row in rows])
 
     def _meet(self, to_ns: int) -> None:
@@ -203,7 +223,8 @@ class NetTracker:
         for depth in stream.depth.between(start_ns, end_ns):
             track.add_depth(index, DepthSeen(depth.stamp_ns, depth.depth_m, depth.sigma_m))
         for frame in stream.frames.between(start_ns, end_ns):
-            track.add_frame(index, frame_of(view_of(frame)))
+            if not frame.trigger % self.one_in:
+                track.add_frame(index, frame_of(view_of(frame)))
 
     def _message(self, row: NetRow) -> NodePose:
         node = self._nodes[row.node]

@@ -84,14 +84,14 @@ class PairSolver:
     """Solves the triggers of one pair.
 
     alignment: gets each fix, to estimate the clock offset; None for none. crowded: whether there are many other pairs.
-    hurried: whether only one in LOOKS triggers is to be solved, of a pair that rests one in LOOKS^2, because the solver
-    of these pairs cannot keep up.
+    one_in: of so many triggers one is to be solved, of a pair that rests one in LOOKS^2; not of all where the solver of
+    these pairs cannot keep up.
     """
 
     def __init__(self, settings: Settings, alignment: ClockAlignment | None = None) -> None:
         self.settings = settings
         self.alignment = alignment
-        self.crowded = self.hurried = False
+        self.crowded, self.one_in = False, 1
         self._prior = PosePrior()
         self._headings = HeadingOffset()
         self._rarity = Rarity()
@@ -123,7 +123,8 @@ class PairSolver:
 
     def _solve_batch(self, batch: Sequence[Matched]) -> list[Fix | NoFix]:
         # What is read does not depend on which triggers are read with it.
-        wanted = [one for one in batch if self._left_out(one) is None]
+        may_rest = {id(one): self._may_rest(one) for one in batch}
+        wanted = [one for one in batch if self._left_out(one, may_rest[id(one)]) is None]
         try:
             readings = self._read(wanted) if wanted else None
         except NUMERIC_ERRORS as error:
@@ -134,7 +135,7 @@ class PairSolver:
         places = {id(one): place for place, one in enumerate(wanted)}
         found: list[Fix | NoFix] = []
         for one in batch:
-            if (left_out := self._left_out(one)) is not None:
+            if (left_out := self._left_out(one, may_rest[id(one)])) is not None:
                 found.append(left_out)
             elif id(one) in places and readings is not None:
                 found.append(self._decide(one, readings, places[id(one)]))
@@ -142,13 +143,15 @@ class PairSolver:
                 found.append(self._look(one))
         return found
 
-    def _left_out(self, one: Matched) -> NoFix | None:
-        """Return the outcome of a trigger that is not solved, as long as no trigger before it has woken the pair."""
-        may_rest = self._may_rest(one)
-        rests = bool(may_rest or self.hurried) and self._resting.rests(one.stamp_ns)
+    def _left_out(self, one: Matched, may_rest: str) -> NoFix | None:
+        """Return the outcome of a trigger that is not solved, as long as no trigger before it has woken the pair.
+
+        may_rest: what `_may_rest` says of it.
+        """
+        rests = bool(may_rest or self.one_in > 1) and self._resting.rests(one.stamp_ns)
         if may_rest and rests:
             return NoFix("too_few_candidates", may_rest)
-        if self.hurried and one.trigger % (LOOKS * LOOKS if rests else LOOKS):
+        if self.one_in > 1 and one.trigger % (LOOKS * LOOKS if rests else self.one_in):
             return NoFix("unmatched", NO_TIME)
         return None
 

@@ -6,6 +6,7 @@ import math
 import statistics
 from collections import Counter, deque
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import Final, TypeAlias
 
 import numpy as np
@@ -26,7 +27,7 @@ from buddyline.solver_service.sensors import attitude_at
 from buddyline.solver_service.streams import Arrival, NodeStream
 from buddyline.solver_service.track.clocks import Clocks
 from buddyline.solver_service.track.problems import present
-from buddyline.solver_service.tracking import PairTracker, TrackSettings
+from buddyline.solver_service.tracking import Coming, PairTracker, TrackSettings
 from msgspec import UNSET
 
 PairId: TypeAlias = tuple[str, str]
@@ -44,6 +45,14 @@ def newer(messages: list[Message], told_ns: int) -> list[Message]:
     if told_ns < 0:
         return messages
     return [one for one in messages if isinstance(one, RelativePose | Rejected) and one.stamp_ns > told_ns]
+
+
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """Outcomes of a pair, in the order of its triggers, and what its track is about to tell."""
+
+    outcomes: list[Message] = field(default_factory=list)
+    track: Coming = field(default_factory=Coming)
 
 
 class PairCore:
@@ -80,12 +89,12 @@ class PairCore:
         self._settled: list[Message] = []
         self._advised: list[str] = []
 
-    def crowd(self, *, alone: bool, crowded: bool, hurried: bool) -> None:
-        """Note whether this pair is the only one, or one of many; hurried: whether the solver is behind."""
+    def crowd(self, *, alone: bool, crowded: bool, one_in: int) -> None:
+        """Note whether this pair is the only one, or one of many; one_in: of so many triggers one is taken."""
         self._alone = alone
-        self.solver.crowded, self.solver.hurried = crowded, crowded and hurried
+        self.solver.crowded, self.solver.one_in = crowded, one_in
         if self.tracker is not None:
-            self.tracker.crowded = crowded
+            self.tracker.crowded, self.tracker.one_in = crowded, self.solver.one_in
 
     def take(self, frame: Candidates, arrival: Arrival, receive_ns: int | None, *, live: bool) -> None:
         """Take a frame of one of the two nodes; see PairMatcher.take."""
@@ -108,11 +117,20 @@ class PairCore:
 
         told_ns: the track gets only later outcomes.
         """
+        return self.told(self.follow(told_ns))
+
+    def follow(self, told_ns: int = -1) -> Settled:
+        """Settle, but for the track's messages, which may be worked out together with those of other pairs."""
         if not (self._unsettled or self._settled):
-            return []
+            return Settled()
         self._solve()
         settled, self._settled = self._settled, []
-        told = settled + (self.tracker.take(newer(settled, told_ns)) if self.tracker is not None else [])
+        track = self.tracker.follow(newer(settled, told_ns)) if self.tracker is not None else Coming()
+        return Settled(settled, track)
+
+    def told(self, settled: Settled) -> list[Message]:
+        """Return the outcomes, then the track's messages."""
+        told = settled.outcomes + (self.tracker.told(settled.track) if self.tracker is not None else [])
         for message in told:
             if isinstance(message, RelativePose):
                 self._posed_ns = message.stamp_ns

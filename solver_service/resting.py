@@ -1,10 +1,10 @@
-"""Which triggers of a pair are not solved: those of nodes that do not have each other in view, or that time lacks for.
+"""Which triggers of a pair are not solved: of nodes out of each other's view, or for which there is no time.
 
 In a team many pairs are out of each other's view: nearly half of all, where two groups face each other. A pair that had
 no pose for REST_NS rests where its cameras look apart by both attitudes, and in a CROWD anyway: only one in LOOKS of
 its triggers is solved. A pose, or one that only a compass contradicts, wakes it. So a compass that is off costs the
 first poses only, and the cost of many nodes grows with the pairs that are in view. In a crowd whose solver cannot keep
-up, one in LOOKS triggers of each pair is solved, and one in LOOKS^2 of a pair that rests.
+up, one in LOOKS triggers of each pair is solved, or one in LOOKS^2 (pace.py); one in LOOKS^2 of a pair that rests.
 """
 
 from __future__ import annotations
@@ -27,9 +27,7 @@ CROWD: Final = 5
 LOOK_APART: Final = "by both attitudes the cameras look apart"
 NOT_IN_VIEW: Final = "one of many pairs, which had no pose for 5 s"
 # Of those that are left out for want of time; their reason is `unmatched`.
-NO_TIME: Final = (
-    "this solver cannot keep up: until it does, it solves one in five triggers, where a pair rests one in 25"
-)
+NO_TIME: Final = "this solver cannot keep up: until it does, it solves one in five triggers, or one in 25"
 # What iron may add to both compasses together, and how many of their own sigmas count.
 IRON_RAD: Final = math.radians(30.0)
 SIGMAS: Final = 4.0

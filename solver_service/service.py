@@ -14,7 +14,7 @@ import msgspec
 from buddyline.protocol.clock import S_NS, Clock, SystemClock
 from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.errors import MessageError
-from buddyline.protocol.messages import Candidates, Message, Rejected
+from buddyline.protocol.messages import Candidates, Message
 from buddyline.protocol.security import PLAYER
 from buddyline.protocol.service import Service
 from buddyline.protocol.statusfile import StatusFile
@@ -32,10 +32,12 @@ from buddyline.protocol.topics import (
     key_of,
     parse_key,
 )
-from buddyline.solver_service.answered import THIS_DIVE_NS, Answer, Answered, Outcome, answer_of
+from buddyline.solver_service.answered import THIS_DIVE_NS, Answer, Answered, Outcome, answer_of, said_of
 from buddyline.solver_service.config import SolverConfig
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.journal import Journal, Noted
+from buddyline.solver_service.owed import Owed
+from buddyline.solver_service.pace import BEHIND_NS, ONE_IN_FIVE
 from buddyline.solver_service.pair_core import PUBLISHED, PUBLISHED_FOR_NODES, PairId
 from buddyline.solver_service.shared_work import CLAIM_S, SharedWork
 
@@ -53,13 +55,8 @@ STATUS_S: Final = 1.0
 WORDS_S: Final = 0.5
 MAX_ALIVE_NAME: Final = 64
 WAIT_S: Final = 1.0
-# Messages that wait are solved together, which costs half: so many, gathered for so long.
+# So many messages that wait are solved together at most, which costs half.
 TOGETHER: Final = 256
-GATHER_S: Final = 0.05
-# Frames of now that have waited for so long show that the solver cannot keep up; in a crowd it then solves less.
-BEHIND_NS: Final = 1 * S_NS
-# Within this time the nodes have connected again, sent what was missed, and the solver has waited for all.
-OWED_S: Final = 10.0
 
 
 class _FrameHead(msgspec.Struct):
@@ -95,8 +92,7 @@ class SolverService(Service):
         self._subscription: Subscription | None = None
         # Messages that are solved together with those that wait behind them, with their receive times.
         self._came: list[tuple[Message, int]] = []
-        self._gather_until_s = 0.0
-        # How long the newest frame had waited in this process for its turn.
+        # How long the frames of the last such set had waited in this process for their turn, at least.
         self._behind_ns = 0
         self._publishers: dict[str, Publisher] = {}
         self._declared: set[PairId] = set()
@@ -117,12 +113,7 @@ class SolverService(Service):
         self._joined_ns: int | None = None
         self._attached_ns = 0
         self._player = False
-        # Triggers of which an earlier solver had a frame, and that have no outcome yet; with the frame's stamp.
-        self._owed: dict[tuple[PairId, int], int] = {}
-        self._owed_triggers: set[int] = set()
-        self._owed_until_s = 0.0
-        # Node and trigger of frames of such triggers that have come, and wait for their turn or have had it.
-        self._come_again: set[tuple[str, int]] = set()
+        self._owed = Owed(self._answered)
         # Up to this stamp the frames of a node had come, and were noted or answered, before this solver came.
         self._answered_to_ns: dict[str, int] = {}
         self._words_s = 0.0
@@ -182,12 +173,12 @@ class SolverService(Service):
         with self._turn():
             self._take_all()
             if not self._more_waits:
-                self._behind_ns, self.core.hurried = 0, False
+                self._behind_ns = 0
+                self.core.keep_up(0, self.clock.now_ns())
             results = self.core.advance(self.clock.now_ns())
             self._declare()
             self._publish(results)
-            if self._owed and time.monotonic() > self._owed_until_s:
-                self._give_up_owed()
+            self._give_up_owed()
             if status_due or time.monotonic() - self._words_s >= WORDS_S:
                 self._words_s = time.monotonic()
                 self._news |= not status_due and self.core.advises_anew()
@@ -261,7 +252,11 @@ class SolverService(Service):
         if self._work is None:
             past, said = self._read_past(bus)
             self._answered.know(said)
-            self._expect_again(past, said)
+            self._owed.expect(past)
+            for one in said:
+                up_to_ns = self._answered.pair((one.node_a, one.node_b)).up_to_ns
+                for node in (one.node_a, one.node_b):
+                    self._answered_to_ns[node] = min(up_to_ns, self._answered_to_ns.get(node, up_to_ns))
         else:
             bus.subscribe((POSE.key_any(), REJECTED.key_any()), self._hear, history=False)
             log.info("solver: shares the work of this hub as %s", self._work.sharing.instance)
@@ -284,16 +279,15 @@ class SolverService(Service):
             (node,) = parsed[1]
             with suppress(msgspec.DecodeError, UnicodeDecodeError):
                 frame = _FRAME_HEAD.decode(payload)
-                if frame.trigger in self._owed_triggers:
-                    self._come_again.add((node, frame.trigger))
+                self._owed.saw_frame(node, frame.trigger)
                 if frame.stamp_ns > self._answered_to_ns.get(node, -1):
                     self._journal.add_frame(node, frame.trigger, frame.stamp_ns)
 
     def receive(self, received: Received) -> None:
-        """Take one message from the bus; a bad one is counted and reported. At the end a backlog is left to the next.
+        """Take one message from the bus; a bad one is counted and reported. If more wait, they are solved together.
 
-        The end would else wait for the lock, for as long as the backlog lasts. Where more messages wait, they are
-        gathered.
+        Once this solver is told to stop, a backlog is left to the next one: the end would wait for the lock for as long
+        as the backlog lasts.
         """
         if self.stop.is_set():
             return
@@ -305,10 +299,8 @@ class SolverService(Service):
             self._refused = f"bad message on {received.key}: {error}"
         with self._lock:
             if message is not None:
-                if not self._came:
-                    self._gather_until_s = time.monotonic() + GATHER_S
                 self._came.append((message, received.receive_ns))
-            if not self._more_waits or len(self._came) >= TOGETHER or time.monotonic() > self._gather_until_s:
+            if not self._more_waits or len(self._came) >= TOGETHER:
                 self._take_all()
 
     def watch(self, name: str, alive: bool) -> None:
@@ -328,9 +320,13 @@ class SolverService(Service):
             refused, self._refused = self._refused, ""
             self._news = False
             flood = self._bus.flood_problem() if self._bus is not None else ""
-            slow = f"the solver is {self._behind_ns / S_NS:.0f} s behind: too much for this machine; start another one"
-            slow += " elsewhere, all with --share"
-            problems = [one for one in (refused, flood, slow * (self._behind_ns > BEHIND_NS)) if one]
+            problems = [one for one in (refused, flood) if one]
+            if self._behind_ns > BEHIND_NS:
+                problems.append(
+                    f"the solver is {self._behind_ns / S_NS:.0f} s behind: this machine is too slow; lower the nodes' "
+                    "rate, or start further solvers, all with --share"
+                    + (f"; {ONE_IN_FIVE}" if self.core.is_crowded else "")
+                )
             problems += self._work.problems if self._work is not None else []
             statuses = self.core.report(now_ns, now_ns, self.refusals.count, problems)
             if not statuses:
@@ -364,7 +360,7 @@ class SolverService(Service):
                 # All later frames are new too, even if the clock is set.
                 self._joined_ns = 0
             elif self._answered.is_over(pairs, message.stamp_ns, self.clock.now_ns()):
-                self._come_again.discard((message.node, message.trigger))
+                self._owed.saw_unused(message.node, message.trigger)
                 continue
             together.append(message)
             if new and self._is_of_now(message):
@@ -376,7 +372,7 @@ class SolverService(Service):
         if waited_ns:
             # A sender of too much is served last: what waits least shows how far behind the solver is.
             self._behind_ns = min(waited_ns)
-            self.core.hurried = self._behind_ns > BEHIND_NS
+            self.core.keep_up(self._behind_ns, self.clock.now_ns())
         self._handle(together)
         self._handled += len(came)
 
@@ -425,7 +421,7 @@ class SolverService(Service):
         for message in unsaid:
             self._publishers[key_of(message)].put(message)
             if isinstance(message, Outcome):
-                self._owed.pop(((message.node_a, message.node_b), message.trigger), None)
+                self._owed.saw_outcome(message)
         self.core.saw_published(unsaid, self.clock.now_ns())
 
     def _repeat(self, published: Iterable[tuple[str, bytes]]) -> None:
@@ -435,73 +431,23 @@ class SolverService(Service):
                 self._publisher_of(parsed[0], *parsed[1])
             self._publishers[key].repeat(payload)
 
-    def _expect_again(self, past: Noted, said: Iterable[Answer]) -> None:
-        """Note of which triggers an earlier solver has received a frame and said nothing.
-
-        Their nodes have the frames in their caches, unless they have ended too.
-        """
-        for pair, noted in _by_pair(past.said).items():
-            stamps_ns = {trigger: stamp_ns for node, trigger, stamp_ns in past.frames if node in pair}
-            for trigger in self._answered.pair(pair).expect(stamps_ns, noted):
-                self._owed[pair, trigger] = stamps_ns[trigger]
-        self._owed_triggers = {trigger for _, trigger in self._owed}
-        self._owed_until_s = time.monotonic() + OWED_S
-        for pair in _by_pair(said):
-            for node in pair:
-                up_to_ns = self._answered.pair(pair).up_to_ns
-                self._answered_to_ns[node] = min(up_to_ns, self._answered_to_ns.get(node, up_to_ns))
-
     def _give_up_owed(self) -> None:
         """Answer the triggers whose frames have not come again."""
-        owed = {
-            (pair, trigger): stamp_ns
-            for (pair, trigger), stamp_ns in self._owed.items()
-            if not any((node, trigger) in self._come_again or self.core.is_single(node) for node in pair)
-        }
-        detail = "its frames were lost with the solver and node that had them"
-        outcomes = [
-            Rejected(node_a=a, node_b=b, stamp_ns=stamp_ns, trigger=trigger, reason="late", detail=detail)
-            for ((a, b), trigger), stamp_ns in sorted(owed.items())
-        ]
+        outcomes = self._owed.lost(self.core.is_single)
         for outcome in outcomes:
             self._publisher_of(REJECTED, outcome.node_a, outcome.node_b)
         self._publish(outcomes)
-        for pair, trigger in owed:
-            self._owed.pop((pair, trigger), None)
-            self._answered.pair(pair).give_up(trigger)
+        self._owed.give_up(outcomes)
 
     def _read_past(self, bus: Bus, pairs: Iterable[PairId] | None = None) -> tuple[Noted, list[Answer]]:
         """Return what the journals know, of these pairs if given, and the last answers of all solvers so far."""
         past = self._journal.read(self.clock.now_ns(), pairs) if self._journal is not None else Noted()
-        return past, _said_of(_held_by(bus), past.said)
+        return past, said_of(_held_by(bus), past.said)
 
 
 def _pulse(work: SharedWork, stop: threading.Event) -> None:
     while not stop.wait(TICK_S):
         work.pulse()
-
-
-def _said_of(held: Iterable[Answer], noted: Iterable[Answer]) -> list[Answer]:
-    """Return each pair's last outcomes by the journal, or as the hub holds them if the journal does not know those."""
-    by_journal, by_hub = _by_pair(noted), _by_pair(held)
-    said: list[Answer] = []
-    for pair in {**by_journal, **by_hub}:
-        of_journal, of_hub = by_journal.get(pair, []), by_hub.get(pair, [])
-        known = {(one.trigger, one.stamp_ns) for one in of_journal}
-        if of_hub and not any((one.trigger, one.stamp_ns) in known for one in of_hub):
-            said += of_hub
-        else:
-            # What the journal has beyond the hub was published too, and is published again.
-            said += [one for one in of_journal if one.in_order][-1:]
-            said += [one for one in of_journal if not one.in_order]
-    return said
-
-
-def _by_pair(outcomes: Iterable[Answer]) -> dict[PairId, list[Answer]]:
-    found: dict[PairId, list[Answer]] = {}
-    for one in outcomes:
-        found.setdefault((one.node_a, one.node_b), []).append(one)
-    return found
 
 
 def _held_by(bus: Bus) -> list[Answer]:

@@ -7,8 +7,8 @@ same track.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Final
 
@@ -29,6 +29,7 @@ from buddyline.protocol.messages import (
 from buddyline.solver_service.geometry.observation import View
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, rotation_exp
+from buddyline.solver_service.pace import NO_TRACK
 from buddyline.solver_service.resting import LOOK_APART, LOOKS, REST_NS
 from buddyline.solver_service.results import NUMERIC_ERRORS, view_of
 from buddyline.solver_service.sensors import KEPT_NS
@@ -36,15 +37,15 @@ from buddyline.solver_service.streams import NodeStream
 from buddyline.solver_service.track.clocks import Clocks, clock_now, clocks_of
 from buddyline.solver_service.track.dive import smooth
 from buddyline.solver_service.track.filter import TrackFilter
-from buddyline.solver_service.track.foresight import ForeseenLight, foresee
+from buddyline.solver_service.track.forecasts import DueRow, Forecast, make_rows, work_out
+from buddyline.solver_service.track.foresight import ForeseenLight, Foresight, foresee
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, TrackNode
 from buddyline.solver_service.track.lag import EVERY_S, KEPT_S, TrackLag
 from buddyline.solver_service.track.lamps import UNSEEN_PICTURES, UNSEEN_S
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.problems import ENDED_S, as_ended
 from buddyline.solver_service.track.records import NodeRecord, feed, joined
-from msgspec import UNSET
-from msgspec.structs import replace
+from msgspec import UNSET, structs
 
 # For how long after its stamp an expectation serves: its sigma has grown to a large part of the picture by then.
 EXPECT_VALID_NS: Final = S_NS // 2
@@ -59,16 +60,53 @@ class TrackSettings:
     expect: bool = False
 
 
+@dataclass(frozen=True, eq=False)
+class Coming:
+    """What a pair is about to tell: messages, then its tracks' rows, then where its nodes should look for lights.
+
+    stamps_ns: by node, of its next picture. oriented: whether an attitude says where north is.
+    """
+
+    messages: Sequence[Message] = ()
+    rows: Sequence[tuple[DueRow | TrackRow, TrackMode]] = ()
+    foresight: Foresight | None = None
+    stamps_ns: Mapping[int, int] = field(default_factory=dict)
+    oriented: bool = False
+
+    @property
+    def due(self) -> list[DueRow]:
+        """The rows that are to be made."""
+        return [row for row, _ in self.rows if isinstance(row, DueRow)]
+
+    @property
+    def forecasts(self) -> list[Forecast]:
+        """What is to be worked out."""
+        beside = [] if self.foresight is None else [self.foresight.present]
+        return [row.forecast for row in self.due] + beside
+
+
+def work_out_together(of_pairs: Sequence[Coming]) -> None:
+    """Work out what some pairs are about to tell, in one set of arrays."""
+    with np.errstate(all="ignore"):
+        try:
+            work_out(each for one in of_pairs for each in one.forecasts)
+            make_rows(each for one in of_pairs for each in one.due)
+        except NUMERIC_ERRORS:
+            # Whose values are out of range shows where each pair's are worked out by themselves.
+            return
+
+
 class PairTracker:
     """Follows a pair. Messages up to a trigger's time enter the estimator once the trigger's outcome is known.
 
     crowded: whether it is one of many pairs: its live track then starts from poses alone, for in pictures of many bars
     too many starts without a fix are possible. So nothing is fed to it while there is neither a pose nor a track.
+    one_in: of so many triggers and rows one is taken, if not of all without what would come too late (pace.py).
     """
 
     def __init__(self, stream_a: NodeStream, stream_b: NodeStream, settings: TrackSettings) -> None:
         self._filter: TrackFilter | None = None
-        self.crowded = False
+        self.crowded, self.one_in, self._stopped = False, 1, False
         self._past: list[str] = []
         # Inertial samples that came too late, and each node's newest trigger when its last one did.
         self.late_imu = 0
@@ -100,8 +138,24 @@ class PairTracker:
         self._unseen: dict[int, int] = {}
 
     @property
+    def follows(self) -> bool:
+        """Whether there is an estimate."""
+        return self._filter is not None and (self._filter.main is not None or bool(self._filter.challengers))
+
+    def stop(self) -> None:
+        """End the track, and take nothing up to `go_on`."""
+        self.forget()
+        self._stopped = True
+
+    def go_on(self) -> None:
+        """Begin anew with what comes."""
+        self._stopped = False
+
+    @property
     def problems(self) -> list[str]:
         """What is wrong, what was (it says so), and the lamps that are dark now."""
+        if self._stopped:
+            return [*self._past, NO_TRACK]
         if self._filter is None:
             return self._past + self._late()
         found = [problem for problem in self._filter.problems if problem not in self._past]
@@ -158,12 +212,25 @@ class PairTracker:
 
     def take(self, outcomes: Sequence[Message]) -> list[Message]:
         """Go on to the newest of these outcomes; return the live tracks' messages up to there."""
+        return self.told(self.follow(outcomes))
+
+    def follow(self, outcomes: Sequence[Message]) -> Coming:
+        """Go on as `take` does; return what there is to tell, which may be worked out together with other pairs'."""
         with np.errstate(all="ignore"):
             try:
                 return self._take(outcomes)
             except NUMERIC_ERRORS as error:
                 self._start_anew(str(error))
-                return []
+                return Coming()
+
+    def told(self, coming: Coming) -> list[Message]:
+        """Return the messages of what there is to tell."""
+        with np.errstate(all="ignore"):
+            try:
+                return self._told(coming)
+            except NUMERIC_ERRORS as error:
+                self._start_anew(str(error))
+                return list(coming.messages)
 
     def _start_anew(self, why: str) -> None:
         """Drop a track that absurd but finite values have spoiled, such as a depth of 1e308 m."""
@@ -171,7 +238,9 @@ class PairTracker:
         self._note([f"values from {node_a} or {node_b} were out of numeric range ({why}): the track started anew"])
         self.forget()
 
-    def _take(self, outcomes: Sequence[Message]) -> list[Message]:
+    def _take(self, outcomes: Sequence[Message]) -> Coming:
+        if self._stopped:
+            return Coming()
         # A late frame's stamp is old, or far from the dive's time: it does not carry the track on.
         stamps_ns = [
             one.stamp_ns
@@ -180,14 +249,18 @@ class PairTracker:
         ]
         known = [stream.calibration(max(stamps_ns)) for stream in self._streams] if stamps_ns else [None, None]
         if known[0] is None or known[1] is None:
-            return []
+            return Coming()
         infos = known[0][0], known[1][0]
         fixes = [fix_of(one) for one in outcomes if isinstance(one, RelativePose)]
         if fixes:
             self._fixed_ns = max(fix.stamp_ns for fix in fixes)
-        elif self.crowded and min(stamps_ns) - self._fixed_ns > REST_NS and not self._follows():
+        elif (
+            self.crowded
+            and min(stamps_ns) - self._fixed_ns > REST_NS
+            and not (self.follows or "smooth" in self._settings.modes)
+        ):
             self._idle = True
-            return []
+            return Coming()
         messages: list[Message] = []
         if self._infos is not None and not all(map(same_rig, infos, self._infos)):
             # The track of the old rigs ends here.
@@ -221,12 +294,7 @@ class PairTracker:
                 self._filter.add_fix(fix)
         if "smooth" in self._settings.modes:
             self._fixes += fixes
-        return messages + self._advance(self._frontier_ns())
-
-    def _follows(self) -> bool:
-        """Whether an outcome without a pose tells anything: there is an estimate, or the whole dive is kept."""
-        followed = self._filter is not None and (self._filter.main is not None or bool(self._filter.challengers))
-        return followed or "smooth" in self._settings.modes
+        return replace(self._advance(self._frontier_ns()), messages=messages)
 
     def finish(self) -> Iterable[Message]:
         """Take what is left, and return what the end of the dive tells: the rest of the live tracks, the smooth one.
@@ -241,7 +309,7 @@ class PairTracker:
             return []
         with np.errstate(all="ignore"):
             try:
-                messages = self._advance(end_ns)
+                messages = self._told(self._advance(end_ns))
                 if self._lag is not None:
                     messages += self._messages(self._lag.finish(), "lag")
                 if "smooth" not in self._settings.modes:
@@ -268,9 +336,9 @@ class PairTracker:
         """Return up to when everything has come: outcomes, and the samples of the sensors that have not stopped."""
         return min(stream.complete_ns(self._settled_ns) for stream in self._streams)
 
-    def _advance(self, to_ns: int) -> list[Message]:
+    def _advance(self, to_ns: int) -> Coming:
         if to_ns <= self._taken_ns or self._idle:
-            return []
+            return Coming()
         for node, stream in enumerate(self._streams):
             piece = self._piece(stream, node, self._taken_ns + 1, to_ns)
             self._oriented |= bool(piece.attitudes)
@@ -282,51 +350,68 @@ class PairTracker:
         self._unseen = {trigger: ns for trigger, ns in self._unseen.items() if ns > to_ns - S_NS}
         return self._live(to_ns)
 
-    def _live(self, to_ns: int) -> list[Message]:
+    def _live(self, to_ns: int) -> Coming:
         if self._filter is None:
-            return []
-        messages: list[Message] = []
+            return Coming()
+        told: list[tuple[DueRow | TrackRow, TrackMode]] = []
         while self._told_ns < to_ns:
             # After a wait for late samples there is much to take at once; the lag looks at every part of it.
             part_ns = min(to_ns, max(self._told_ns, to_ns - KEPT_NS) + round(EVERY_S * S_NS))
             due = self._due(self._told_ns + 1, part_ns)
             self._told_ns = part_ns
-            rows = self._filter.advance(part_ns, due)
+            rows = list(self._filter.coming(part_ns, due))
             if self._filter.main is not None and not np.isfinite(self._filter.main.covariance).all():
                 raise ArithmeticError("no finite covariance")
             if "filter" in self._settings.modes:
-                messages += self._messages(rows, "filter")
-            if self._lag is not None:
+                told += [(row, "filter") for row in rows]
+            if self._lag is not None and self.one_in == 1:
                 self._lag.ask(due)
-                messages += self._messages(self._lag.rows(), "lag")
-        return messages + (self._expect(self._filter, to_ns) if self._settings.expect else [])
+                told += [(row, "lag") for row in self._lag.rows()]
+        stamps_ns = self._next_ns() if self._settings.expect and self.one_in == 1 else {}
+        foresight = foresee(self._filter, to_ns, stamps_ns)
+        return Coming(rows=told, foresight=foresight, stamps_ns=stamps_ns, oriented=self._oriented)
 
-    def _expect(self, track: TrackFilter, to_ns: int) -> list[Message]:
-        """Return where each node's next picture should show the other's lights."""
+    def _next_ns(self) -> dict[int, int]:
+        """Return when each node's next picture is due."""
         if self._infos is None:
-            return []
-        stamps_ns = {
+            return {}
+        return {
             node: stream.newest_ns + self._infos[node].trigger_period_ns
             for node, stream in enumerate(self._streams)
             if stream.newest_ns is not None
         }
+
+    def _told(self, coming: Coming) -> list[Message]:
+        node_a, node_b = (stream.node for stream in self._streams)
+        make_rows(coming.due)
+        made = [(one.row if isinstance(one, DueRow) else one, mode) for one, mode in coming.rows]
+        tracks = [
+            track_message(row, node_a, node_b, mode, oriented=coming.oriented) for row, mode in made if row is not None
+        ]
+        return [*coming.messages, *tracks, *self._expected(coming)]
+
+    def _expected(self, coming: Coming) -> list[Message]:
+        """Return where each node's next picture should show the other's lights."""
+        if self._infos is None or coming.foresight is None:
+            return []
         return [
             Expect(
                 node=self._streams[node].node,
                 seen=self._streams[1 - node].node,
-                stamp_ns=stamps_ns[node],
+                stamp_ns=coming.stamps_ns[node],
                 valid_ns=EXPECT_VALID_NS,
                 lights=[_expected_light(light) for light in lights],
                 blink=self._infos[1 - node].blink,
             )
-            for node, lights in foresee(track, to_ns, stamps_ns).items()
+            for node, lights in coming.foresight.lights().items()
             if lights
         ]
 
     def _due(self, start_ns: int, end_ns: int) -> list[int]:
         """Return the instants of the rows from start_ns to end_ns."""
         first = -(-start_ns // self._period_ns)
-        return [k * self._period_ns for k in range(first, end_ns // self._period_ns + 1)]
+        rows = range(first, end_ns // self._period_ns + 1)
+        return [k * self._period_ns for k in rows if not k % self.one_in]
 
     def _piece(self, stream: NodeStream, node: int, start_ns: int, end_ns: int) -> NodeRecord:
         if self._nodes is None:
@@ -339,7 +424,7 @@ class PairTracker:
             frames=[
                 frame_of(view_of(frame))
                 for frame in stream.frames.between(start_ns, end_ns)
-                if frame.trigger not in self._unseen
+                if frame.trigger not in self._unseen and not frame.trigger % self.one_in
             ],
             imu_stamps_ns=stamps_ns,
             accel_mps2=values[:, :3],
@@ -407,7 +492,7 @@ def track_node_of(info: NodeInfo, rig: Rig) -> TrackNode:
 
 def same_rig(info: NodeInfo, other: NodeInfo) -> bool:
     """Whether two calibrations are one, whenever each was stated."""
-    return info is other or info == replace(other, stamp_ns=info.stamp_ns)
+    return info is other or info == structs.replace(other, stamp_ns=info.stamp_ns)
 
 
 def frame_of(view: View) -> FrameSeen:

@@ -17,7 +17,7 @@ import math
 import sys
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 from unittest.mock import patch
@@ -116,7 +116,7 @@ def told(grade: Grade) -> Iterator[None]:
     if not grade.shake_radps:
         still = np.full(2, 2.0 * math.log(1e-6))
         shaken = {"SHAKE_RAD": 1e-6, "SHOVE_MPS": 1e-6, "_BOUNDS": (still, still)}
-    with patch.multiple(state, **sigmas), patch.multiple(shaking, **shaken) if shaken else patch.multiple(state):
+    with patch.multiple(state, **sigmas), patch.multiple(shaking, **shaken) if shaken else nullcontext():
         yield
 
 

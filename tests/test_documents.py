@@ -78,11 +78,22 @@ def wrong(text: str) -> list[str]:
     return found
 
 
+def headings(path: Path) -> set[str]:
+    """Return the anchors of a document's headings, as GitHub and the site name them."""
+    lines = re.findall(r"^#+ (.*)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", line.lower()).replace(" ", "-") for line in lines}
+
+
 def dead_links(path: Path) -> list[str]:
-    """Return the links of a document to files that are not there."""
-    targets = [target.partition("#")[0] for target in LINK.findall(path.read_text(encoding="utf-8"))]
-    local = [target for target in targets if target and "://" not in target and not target.startswith("mailto:")]
-    return [target for target in local if not (path.parent / target).exists()]
+    """Return the links of a document to files, and to headings in documents, that are not there."""
+    targets = LINK.findall(path.read_text(encoding="utf-8"))
+    dead = []
+    for target in (one for one in targets if "://" not in one and not one.startswith("mailto:")):
+        file, _, heading = target.partition("#")
+        there = path.parent / file if file else path
+        if not there.exists() or (heading and heading not in headings(there)):
+            dead.append(target)
+    return dead
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(REPOSITORY)))
@@ -122,5 +133,7 @@ def test_a_missing_file_or_command_is_found(text: str, says: str) -> None:
 
 
 def test_a_dead_link_is_found(tmp_path: Path) -> None:
-    (tmp_path / "a.md").write_text("[here](a.md), [there](b.md#x), [far](https://example.org)\n")
-    assert dead_links(tmp_path / "a.md") == ["b.md"]
+    (tmp_path / "a.md").write_text(
+        "# A: one\n[here](a.md#a-one), [no](#two), [there](b.md#x), [far](https://example.org)\n"
+    )
+    assert dead_links(tmp_path / "a.md") == ["#two", "b.md#x"]

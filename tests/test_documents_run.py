@@ -274,7 +274,7 @@ def test_the_python_of_a_document_runs(name: str, folder: Path) -> None:
     for solved in ("solved.mcap", "poses.mcap"):
         assert main(["solve", "sample.mcap", "-o", solved]) == 0
     endpoint = free_endpoint()
-    script = "\n".join(blocks).replace('"tcp/192.168.2.1:7447"', f'"{endpoint}", seconds=5')
+    script = "\n".join(blocks).replace("live_poses()", f'live_poses("{endpoint}", seconds=5)')
     with ExitStack() as stack:
         if endpoint in script:
             for words in (("hub", "--listen"), ("solver", "--connect"), ("play", "sample.mcap", "--loop", "--connect")):

@@ -26,6 +26,7 @@ def test_the_site_is_made_without_a_warning(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
     commands = (tmp_path / "site" / "commands.html").read_text()
     assert "buddyline sample" in commands
+    assert "buddyline calibrate lights" in commands
     messages = (tmp_path / "site" / "messages.html").read_text()
     assert all(topic.schema.__name__ in messages and topic.template in messages for topic in TOPICS)
     assert "trajectories" in (tmp_path / "site" / "index.html").read_text()

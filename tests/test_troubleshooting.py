@@ -10,6 +10,8 @@ from typing import get_args
 
 import pytest
 from buddyline.protocol.messages import Reason
+from buddyline.solver_service.pace import NO_NETWORK, NO_TRACK, ONE_IN_FIVE
+from buddyline.solver_service.resting import NO_TIME
 from buddyline.tools.health.words import REASONS
 
 from tests.processes import REPOSITORY
@@ -63,6 +65,14 @@ def test_each_finding_has_an_entry() -> None:
 def test_each_alarm_of_a_survey_has_an_entry() -> None:
     assert len(alarms()) > 5
     assert alarms() <= entries() | {"ALARM"}
+
+
+def test_each_text_of_a_solver_that_cannot_keep_up_has_an_entry() -> None:
+    for said in (NO_TRACK, NO_NETWORK):
+        assert said.split(":")[0] in entries()
+    assert "the solver is 2 s behind: this machine is too slow" in entries()
+    whole = PAGE.read_text(encoding="utf-8")
+    assert all(word in whole for word in re.findall(r"one in \w+", f"{NO_TIME} {ONE_IN_FIVE}"))
 
 
 @pytest.mark.parametrize("word", ["range_gap", "compass", "sights"])

@@ -18,7 +18,7 @@ from buddyline.solver_service.network.sights import columns, light_positions
 from buddyline.solver_service.network.state import BLOCK, P_, PHI, V_, NetState, block, lone
 from buddyline.solver_service.network.trail import Present, Told
 from buddyline.solver_service.track import anchors
-from buddyline.solver_service.track.association import weigh
+from buddyline.solver_service.track.association import odds_of
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.intake import TrackIntake, newest_before
 from buddyline.solver_service.track.lights import Sight, in_picture, pixel_of, residuals
@@ -116,34 +116,35 @@ class NetEstimate(NetBelief):
         assert self.state is not None
         camera = self.nodes[sight.node].rig.camera
         dt_s = sight.dt_s + (sight.t_s - self.t_s)
-        bars, compared, inside = [], [], []
-        clutter = sight.clutter / camera.area_px2
-        for other, member in enumerate(self.members):
-            if other == observer or member.node in self.dark:
-                continue
-            if sight.t_s < max(member.skip_s, self.members[observer].skip_s if not member.confirmed else -np.inf):
-                continue
-            lights_m = self.nodes[member.node].rig.lights_m
-            X, D = light_positions(
-                self.state, observer, other, lights_m, self.rates_radps, dt_s if len(dt_s) else np.zeros(1)
-            )
-            which = columns(observer, other)
-            P = self.covariance[np.ix_(which, which)]
-            wide = float(np.trace(D[0, 0] @ P @ D[0, 0].T)) > (0.1 * float(np.linalg.norm(X[0, 0]))) ** 2
-            pixels = [pixel_of(camera, X[0, light]) for light in (0, 1)]
-            if not wide and not any(in_picture(camera, pixel, -OUTSIDE_PX) for pixel in pixels):
-                continue
-            within = [wide or in_picture(camera, pixel, EDGE_PX) for pixel in pixels]
-            detection = self.detection.setdefault((sight.node, member.node), np.full(2, 0.8))
-            shines = self._lit(member.node, sight)
-            found = np.where(shines, detection * np.where(within, 1.0, 0.02), SHOWN_DARK)
-            y, H = residuals(sight.bearings, sight.tangents, X[: len(dt_s)], D[: len(dt_s)])
-            bars.append(weigh(y, H, P, sight.sigma_px, found, clutter))
-            compared.append((other, which, y, H))
-            inside.append([there and on for there, on in zip(within, shines, strict=True)])
-        if not bars:
+        others = [other for other in range(len(self.members)) if self._may_show(observer, other, sight)]
+        if not others:
             return
-        shared = share(bars, sight.sigma_px)
+        lights_m = np.array([self.nodes[self.members[other].node].rig.lights_m for other in others])
+        X, D = light_positions(self.state, observer, others, lights_m, self.rates_radps, dt_s)
+        which = np.array([columns(observer, other) for other in others])
+        P = self.covariance[which[:, :, None], which[:, None, :]]
+        first = D[:, 0, 0]
+        spread_m2 = np.trace(first @ P @ np.swapaxes(first, 1, 2), axis1=1, axis2=2)
+        wide = spread_m2 > 0.01 * (X[:, 0, 0] ** 2).sum(axis=1)
+        kept, likely, inside = [], [], []
+        for bar, other in enumerate(others):
+            node = self.members[other].node
+            pixels = [pixel_of(camera, X[bar, 0, light]) for light in (0, 1)]
+            if not wide[bar] and not any(in_picture(camera, pixel, -OUTSIDE_PX) for pixel in pixels):
+                continue
+            within = [bool(wide[bar]) or in_picture(camera, pixel, EDGE_PX) for pixel in pixels]
+            detection = self.detection.setdefault((sight.node, node), np.full(2, 0.8))
+            shines = self._lit(node, sight)
+            kept.append(bar)
+            likely.append(np.where(shines, detection * np.where(within, 1.0, 0.02), SHOWN_DARK))
+            inside.append([there and on for there, on in zip(within, shines, strict=True)])
+        if not kept:
+            return
+        y, H = residuals(sight.bearings, sight.tangents, X[kept], D[kept])
+        clutter = np.full(len(kept), sight.clutter / camera.area_px2)
+        every = odds_of(y, H, P[kept], np.tile(sight.sigma_px, (len(kept), 1)), clutter)
+        shared = share([odds.weighed(found) for odds, found in zip(every, likely, strict=True)], sight.sigma_px)
+        compared = [(others[bar], which[bar], y[place], H[place]) for place, bar in enumerate(kept)]
         self.evidence += shared.total
         for (other, *_), seen, gained, within in zip(compared, shared.seen, shared.evidence, inside, strict=True):
             member = self.members[other]
@@ -155,6 +156,12 @@ class NetEstimate(NetBelief):
             np.clip(detection, 0.02, 0.97, out=detection)
         if shared.chosen:
             self._update(observer, sight, shared.chosen, compared)
+
+    def _may_show(self, observer: int, other: int, sight: Sight) -> bool:
+        """Whether a picture of a member may tell of another's lights."""
+        member = self.members[other]
+        skip_s = max(member.skip_s, self.members[observer].skip_s if not member.confirmed else -np.inf)
+        return other != observer and member.node not in self.dark and sight.t_s >= skip_s
 
     def _lit(self, node: int, sight: Sight) -> tuple[bool, bool]:
         """Return which of a node's lamps are lit in a picture."""

@@ -41,7 +41,7 @@ class Shared:
 
 
 def share(bars: Sequence[tuple[list[Case], Floats]], sigma_px: Floats) -> Shared:
-    """Weigh the assignments of all bars, each given as `association.weigh` gives it, together."""
+    """Weigh the assignments of all bars, each given as `association.Odds.weighed` gives it, together."""
     kept = [_likely(cases, logs) for cases, logs in bars]
     chosen: list[tuple[int, int, int, float]] = []
     seen, evidence, total = np.zeros((len(bars), 2)), np.zeros(len(bars)), 0.0

@@ -106,5 +106,5 @@ def shaking_parts(R: Floats, span_s: float) -> Floats:
     velocity[V_, SHOVE] = velocity[SHOVE, V_] = -fresh * _I
     velocity[P_, V_] = velocity[V_, P_] = both * _I
     velocity[P_, SHOVE] = velocity[SHOVE, P_] = -both * _I
-    velocity[P_, P_] = t * t * max(2.0 * span_s / t - 3.0 + 4.0 * a - a * a, 0.0) * _I
+    velocity[P_, P_] = t * t * np.maximum(2.0 * span_s / t - 3.0 + 4.0 * a - a * a, 0.0) * _I
     return out

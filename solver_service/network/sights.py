@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -21,35 +22,33 @@ def columns(observer: int, other: int) -> Floats:
 
 
 def light_positions(
-    state: NetState, observer: int, other: int, lights_m: Floats, rates_radps: Floats, dt_s: Floats
+    state: NetState, observer: int, others: Sequence[int], lights_m: Floats, rates_radps: Floats, dt_s: Floats
 ) -> tuple[Floats, Floats]:
-    """Give a node's lights (L, 3) in the observer's camera frame at times dt_s (K,) after the state's.
+    """Give other nodes' (B) lights (B, L, 3) in the observer's camera frame at times dt_s (K,) after the state's.
 
-    Returns X (K, L, 3) and D (K, L, 3, WIDTH): dX by the errors of `columns`. rates_radps (n, 3): turn rates. With
-    a = p + R l the light's place in the net's frame, all carried on by v and w, for the other node by the difference of
-    both clocks too:
+    Returns X (B, K, L, 3) and D (B, K, L, 3, WIDTH): dX by the errors of `columns`. rates_radps (n, 3): turn rates.
+    Where all times are one, or there is none, K is 1. With a = p + R l the light's place in the net's frame, all
+    carried on by v and w, for the other node by the difference of both clocks too:
     X = R_i^T (a - p_i),  dX = R_i^T (dp_j - dp_i + t_j dv_j - t_i dv_i - [a]x (phi_j - phi_i)) + R_i^T a' (dc_j - dc_i)
     """
     alike = bool((dt_s == dt_s[:1]).all())
     times = dt_s if not alike else dt_s[:1] if len(dt_s) else np.zeros(1)
-    late_s = float(state.clock_s[other] - state.clock_s[observer])
-    ahead = times + late_s
+    of_other = list(others)
+    ahead = times + (state.clock_s[of_other] - state.clock_s[observer])[:, None]  # (B, T)
     toward = np.swapaxes(state.R[observer] @ turns_over(rates_radps[observer], times), 1, 2)[:, None]  # (T, 1, 3, 3)
-    R_other = state.R[other] @ turns_over(rates_radps[other], ahead)
-    arms = np.swapaxes(R_other @ lights_m.T, 1, 2)  # (T, L, 3)
-    swept = np.swapaxes(R_other @ (skew(rates_radps[other]) @ lights_m.T), 1, 2)
-    a = (state.p_m[other] + ahead[:, None] * state.v_mps[other])[:, None] + arms
+    R_other = state.R[of_other][:, None] @ turns_over(rates_radps[of_other], ahead)
+    v_mps, lamps = state.v_mps[of_other][:, None], np.swapaxes(lights_m, 1, 2)
+    arms = np.swapaxes(R_other @ lamps[:, None], -1, -2)  # (B, T, L, 3)
+    swept = np.swapaxes(R_other @ (skew(rates_radps[of_other]) @ lamps)[:, None], -1, -2)
+    a = (state.p_m[of_other][:, None] + ahead[..., None] * v_mps)[:, :, None] + arms
     eye = (state.p_m[observer] + times[:, None] * state.v_mps[observer])[:, None]
     X = (toward @ (a - eye)[..., None])[..., 0]
     D = np.zeros((*X.shape, WIDTH))
     half = WIDTH // 2
     D[..., half : half + 3] = toward
-    D[..., half + 3 : half + 6] = toward * ahead[:, None, None, None]
+    D[..., half + 3 : half + 6] = toward * ahead[..., None, None, None]
     D[..., half + 6 : half + 9] = -(toward @ skew(a))
-    D[..., half + 9] = (toward @ (state.v_mps[other] + swept)[..., None])[..., 0]
+    D[..., half + 9] = (toward @ (v_mps[:, :, None] + swept)[..., None])[..., 0]
     D[..., :half] = -D[..., half:]
     D[..., 3:6] = -toward * times[:, None, None, None]
-    if alike:
-        K = len(dt_s)
-        X, D = np.broadcast_to(X, (K, *X.shape[1:])), np.broadcast_to(D, (K, *D.shape[1:]))
     return X, D

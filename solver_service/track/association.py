@@ -90,7 +90,11 @@ class Odds:
 def associate(
     y: Floats, H: Floats, P: Floats, sigma_px: Floats, detection: Floats, clutter_per_px2: float
 ) -> Association:
-    """Weigh every assignment of candidates (K) to two lights, each of which may be missing; arguments as of `weigh`."""
+    """Weigh every assignment of candidates (K) to two lights, each of which may be missing.
+
+    y (K, 2, 2), H (K, 2, 2, C): residuals and Jacobians, by candidate and light; P (C, C): covariance of the errors.
+    detection (2,): how likely each light is to be among the candidates. The odds are against clutter alone.
+    """
     [odds] = odds_of(y[None], H[None], P[None], sigma_px[None], np.array((clutter_per_px2,)))
     return odds.associate(sigma_px, detection)
 
@@ -102,20 +106,8 @@ def variance_of(sigma_px: float, common: float, gross: float) -> float:
     return sigma_px**2 + added_px2
 
 
-def weigh(
-    y: Floats, H: Floats, P: Floats, sigma_px: Floats, detection: Floats, clutter_per_px2: float
-) -> tuple[list[Case], Floats]:
-    """Give every assignment of candidates (K) to two lights, each of which may be missing, and the logs of their odds.
-
-    y (K, 2, 2), H (K, 2, 2, C): residuals and Jacobians, by candidate and light; P (C, C): covariance of the errors.
-    detection (2,): how likely each light is to be among the candidates. The odds are against clutter alone.
-    """
-    [odds] = odds_of(y[None], H[None], P[None], sigma_px[None], np.array((clutter_per_px2,)))
-    return odds.weighed(detection)
-
-
 def odds_of(y: Floats, H: Floats, P: Floats, sigma_px: Floats, clutter_per_px2: Floats) -> list[Odds]:
-    """Give the odds of pictures (N), their arguments as of `weigh`: y (N, K, 2, 2), P (N, C, C), clutter (N,).
+    """Give the odds of pictures (N), or of bars, as of `associate`: y (N, K, 2, 2), P (N, C, C), clutter (N,).
 
     Where a picture has fewer candidates than others, the rest have infinite residuals, H of 0 and sigmas of 1.
     """

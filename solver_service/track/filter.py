@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import heapq
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from itertools import islice
 from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_log
 from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.estimate import Estimate, alike, lead
+from buddyline.solver_service.track.forecasts import TOGETHER, DueRow, Forecast, Way, make_rows, of_state
 from buddyline.solver_service.track.inputs import AttitudeSeen, FixSeen, TrackNode
 from buddyline.solver_service.track.intake import newest_before
 from buddyline.solver_service.track.lights import BLOCK, Sight
-from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S
-from buddyline.solver_service.track.output import TrackRow, at_one_time, at_one_time_jacobian, pose_jacobian, rows_of
+from buddyline.solver_service.track.moving import HOLD_S, excerpt
+from buddyline.solver_service.track.output import TrackRow, at_one_time, at_one_time_jacobian, pose_jacobian
 from buddyline.solver_service.track.pool import MAX_TENTATIVE, TrackPool
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.start import CLOCK_S, state_from_fix
 from buddyline.solver_service.track.state import CLOCK, State, place_covariance
 from buddyline.solver_service.track.stepping import TICK_S
+from buddyline.solver_service.track.strapdown import kept_shares
 from buddyline.solver_service.track.walking import Walking
 
 # Log odds by which an estimate must explain its pictures better than clutter to be confirmed, and a challenger better
@@ -72,16 +75,6 @@ LITTLE_S: Final = 0.01
 MEMORY_S: Final = 30.0
 
 
-@dataclass(frozen=True, eq=False)
-class StateNow:
-    """A track at one time: its state, covariance (SIZE, SIZE) and turn rates (2, 3)."""
-
-    t_s: float
-    state: State
-    covariance: Floats
-    rates_radps: Floats
-
-
 class TrackFilter(TrackPool):
     """The track of nodes a (0) and b (1). Samples and events may be added in any order before `advance` passes them.
 
@@ -96,7 +89,7 @@ class TrackFilter(TrackPool):
         self._waiting: list[Estimate] = []
         self._refused = 0
         self._apart_s = -np.inf
-        self._last_row: tuple[Estimate, StateNow] | None = None
+        self._last_row: tuple[Estimate, Forecast] | None = None
 
     def advance(self, to_ns: int, outputs_ns: list[int] | None = None) -> list[TrackRow]:
         """Go on to to_ns, up to which all has been added; return the track at the asked stamps in between.
@@ -104,8 +97,16 @@ class TrackFilter(TrackPool):
         Events within HOLD_S of to_ns wait for the next call, so that the result does not depend on how often it is
         called.
         """
-        end_s = self.seconds(0, to_ns) - HOLD_S
         rows: list[TrackRow] = []
+        coming = self.coming(to_ns, outputs_ns)
+        while some := list(islice(coming, TOGETHER)):
+            make_rows(some)
+            rows += [one.row for one in some if one.row is not None]
+        return rows
+
+    def coming(self, to_ns: int, outputs_ns: list[int] | None = None) -> Iterator[DueRow]:
+        """Go on as `advance` does while rows are taken; give those that are still to be made."""
+        end_s = self.seconds(0, to_ns) - HOLD_S
         for stamp_ns in outputs_ns or ():
             self._push(self.between(stamp_ns), 3, stamp_ns)
         while self._events and self._events[0][0] <= end_s:
@@ -113,7 +114,7 @@ class TrackFilter(TrackPool):
             if isinstance(what, int):
                 row = self._row(t_s, what)
                 if row is not None:
-                    rows.append(row)
+                    yield row
             elif isinstance(what, FixSeen):
                 self._take_fix(t_s, what)
             else:
@@ -122,9 +123,8 @@ class TrackFilter(TrackPool):
             # Without rows in between, an estimate stays where the last picture was.
             end_s = min([end_s, *(estimate.t_s for estimate in [*self._estimates(), *self._waiting[:1]])])
         self._forget_before(end_s - MEMORY_S)
-        return rows
 
-    def present(self, t_s: float) -> StateNow | None:
+    def present(self, t_s: float) -> Forecast | None:
         """Return the confirmed track at t_s, or its last row where that is at most LITTLE_S before.
 
         All events up to t_s must have been added. None where there is no such track, or it ends before.
@@ -137,11 +137,20 @@ class TrackFilter(TrackPool):
             return row[1]
         return self._present(main, t_s)
 
-    def _present(self, estimate: Estimate, t_s: float) -> StateNow:
-        if t_s <= estimate.t_s:
-            return StateNow(estimate.t_s, estimate.state, estimate.covariance, estimate.rates_radps)
-        parts = self.increments(estimate, t_s)
-        return StateNow(t_s, *self._predict(estimate, t_s, parts=parts), parts.rate_radps)
+    def _present(self, estimate: Estimate, t_s: float) -> Forecast:
+        state, from_s, P = estimate.state, estimate.t_s, estimate.covariance
+        if t_s <= from_s:
+            return of_state(from_s, state, P, estimate.rates_radps)
+        a, b = (
+            excerpt(samples, delay_s, from_s, t_s)
+            for samples, delay_s in zip(self.samples, state.delay_s.tolist(), strict=True)
+        )
+        noises, span_s = self._noises(estimate, t_s), t_s - from_s
+        without = np.array((a.without, b.without))
+        shares = kept_shares(without, noises, span_s) * (without == estimate.without)
+        sudden_rad = np.array((a.values[:, 12].max(), b.values[:, 12].max()))
+        shaking = self._with_sudden(estimate.shaking.variances, sudden_rad)
+        return Forecast(t_s, Way(span_s, state, P, (a, b), noises, shares, shaking))
 
     def doubted(self) -> bool:
         """Whether a live track is not to be told; `problems` says why.
@@ -224,7 +233,7 @@ class TrackFilter(TrackPool):
             self.challengers = self.challengers[-3:]
 
     def _agrees(self, estimate: Estimate, t_s: float, fix: FixSeen) -> bool:
-        state, P = self._predict(estimate, t_s, TOGETHER_S)
+        state, P = self._predict(estimate, t_s)
         now = at_one_time(state, estimate.rates_radps)
         J = (pose_jacobian(now) @ at_one_time_jacobian(state, estimate.rates_radps))[:6]
         toward = now.R[0].T
@@ -380,7 +389,7 @@ class TrackFilter(TrackPool):
             return estimate
         return self._replayed(estimate)
 
-    def _row(self, t_s: float, stamp_ns: int) -> TrackRow | None:
+    def _row(self, t_s: float, stamp_ns: int) -> DueRow | None:
         if self.main is None or not self.main.confirmed or t_s < self.main.t_s:
             return None
         main = self.main
@@ -390,11 +399,4 @@ class TrackFilter(TrackPool):
             self._step(main, main.t_s + TICK_S, None)
         row = self._present(main, t_s)
         self._last_row = main, row
-        return rows_of(
-            (stamp_ns,),
-            State.of_row(row.state.to_row()[None]),
-            row.covariance[BLOCK][None],
-            main.rates_radps[None],
-            np.array((main.lights,)),
-            np.array((t_s - main.light_s,)),
-        )[0]
+        return DueRow(stamp_ns, row, main.rates_radps, main.lights, t_s - main.light_s)

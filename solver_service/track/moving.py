@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 
 import numpy as np
@@ -26,6 +26,7 @@ from buddyline.solver_service.track.state import (
     invariant_of_plain,
 )
 from buddyline.solver_service.track.strapdown import (
+    Bools,
     Carried,
     Increments,
     Noise,
@@ -62,6 +63,50 @@ MOST_GAP_RATE: Final = 4.0
 Number = TypeVar("Number", np.float64, np.bool_)
 
 
+@dataclass(frozen=True, eq=False)
+class Excerpt:
+    """One node's samples between two times: times_s (M,), values (M, 13), told (M - 1,), slow_radps (2, 3).
+
+    As in SampleGrid. without: whether there is no unit at all.
+    """
+
+    times_s: Floats
+    values: Floats
+    told: Bools
+    slow_radps: Floats
+    without: bool
+
+
+def excerpt(samples: Samples, delay_s: float, from_s: float, to_s: float) -> Excerpt:
+    """Give a node's samples from one time to the next, by its own clock's delay."""
+    known_s = to_s + HOLD_S
+    shift = min(max(delay_s, -MAX_DELAY_S), MAX_DELAY_S)
+    times_s, values, told = samples.between(from_s + shift, to_s + shift, known_s)
+    without = not told.any() and not samples.near(to_s + shift, known_s)
+    if without:
+        values[:, :6] = 0.0
+    slow = values[[0, -1], 3:6]
+    for end, each_s in ((0, from_s + shift), (-1, to_s + shift)):
+        rate = samples.slow_rate(each_s, known_s)
+        if rate is not None:
+            slow[end] = rate
+    return Excerpt(times_s, values, told, slow, without)
+
+
+def integrated(state: Carried, of_nodes: Sequence[Excerpt], *, by_shares: bool = False) -> Increments:
+    """Integrate the samples of nodes, each with its own state and times."""
+    every = _padded([one.values for one in of_nodes])
+    grid = SampleGrid(
+        _padded([one.times_s for one in of_nodes]),
+        every[..., :6],
+        _padded([one.told for one in of_nodes]),
+        np.array([one.slow_radps for one in of_nodes]),
+        every[..., 6:12] if by_shares else None,
+    )
+    without = np.array([one.without for one in of_nodes])
+    return replace(integrate(state, grid), without=without, sudden_rad=every[..., 12].max(axis=1))
+
+
 def increments(
     of_nodes: Sequence[Samples], state: Carried, from_s: float, to_s: float, *, by_shares: bool = False
 ) -> Increments:
@@ -69,26 +114,11 @@ def increments(
 
     by_shares: whether to tell what shares of the samples' fast parts do.
     """
-    known_s = to_s + HOLD_S
-    without = np.zeros(len(of_nodes), dtype=bool)
-    slow = np.empty((len(of_nodes), 2, 3))
-    grids, values, told = [], [], []
-    for node, (samples, delay_s) in enumerate(zip(of_nodes, state.delay_s.tolist(), strict=True)):
-        shift = min(max(delay_s, -MAX_DELAY_S), MAX_DELAY_S)
-        times_s, at, covered = samples.between(from_s + shift, to_s + shift, known_s)
-        without[node] = not covered.any() and not samples.near(to_s + shift, known_s)
-        if without[node]:
-            at[:, :6] = 0.0
-        for end, each_s in ((0, from_s + shift), (-1, to_s + shift)):
-            rate = samples.slow_rate(each_s, known_s)
-            slow[node, end] = at[end, 3:6] if rate is None else rate
-        grids.append(times_s)
-        values.append(at)
-        told.append(covered)
-    every = _padded(values)
-    fast = every[..., 6:12] if by_shares and any(samples.parted for samples in of_nodes) else None
-    parts = integrate(state, SampleGrid(_padded(grids), every[..., :6], _padded(told), slow, fast))
-    return replace(parts, without=without, sudden_rad=every[..., 12].max(axis=1))
+    found = [
+        excerpt(samples, delay_s, from_s, to_s)
+        for samples, delay_s in zip(of_nodes, state.delay_s.tolist(), strict=True)
+    ]
+    return integrated(state, found, by_shares=by_shares and any(samples.parted for samples in of_nodes))
 
 
 def _padded(rows: Sequence[NDArray[Number]]) -> NDArray[Number]:
@@ -232,14 +262,12 @@ class TrackMoves(TrackIntake):
         rate = math.sqrt(float(y @ y) / max(span_s, TOGETHER_S) ** 3)
         return replace(noise, gap_rate_radps=max(noise.gap_rate_radps, min(rate, MOST_GAP_RATE)))
 
-    def _predict(
-        self, estimate: Estimate, t_s: float, least_s: float = 0.0, parts: Increments | None = None
-    ) -> tuple[State, Floats]:
-        """Return state and covariance at t_s. parts: `increments` to there, where they are known already."""
+    def _predict(self, estimate: Estimate, t_s: float) -> tuple[State, Floats]:
+        """Return state and covariance at t_s, within TOGETHER_S those of now."""
         span_s = t_s - estimate.t_s
-        if span_s <= least_s:
+        if span_s <= TOGETHER_S:
             return estimate.state, estimate.covariance
-        parts = self.increments(estimate, t_s) if parts is None else parts
+        parts = self.increments(estimate, t_s)
         noises = self._noises(estimate, t_s)
         shares = kept_shares(parts.without, noises, span_s) * (parts.without == estimate.without)
         after, F = propagate(estimate.state, parts, span_s, shares)

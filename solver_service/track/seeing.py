@@ -80,6 +80,7 @@ class TrackSights(TrackMoves):
         observer = sight.node
         camera = self.nodes[observer].rig.camera
         X, y, H = self._compared(sight, estimate.state, estimate.rates_radps, sight.t_s - estimate.t_s)
+        exact = sight
         # Starts are weighed by their evidence: one that doubts its own clock must not explain more with it.
         if estimate.confirmed:
             sight = _widened(sight, H, estimate.covariance)
@@ -100,11 +101,12 @@ class TrackSights(TrackMoves):
         elif guide is None:
             found = associate(y, H, estimate.covariance[BLOCK], sight.sigma_px, detection, clutter)
         else:
-            found = self._odds(guide, sight).associate(sight.sigma_px, detection)
+            found = self._odds(guide, exact).associate(sight.sigma_px, detection)
         if wide and found.chosen and estimate.confirmed:
             y, H = self._about(estimate, sight, found.chosen, guide)
         # What another estimate chose may be behind the camera by this one.
-        found = replace(found, chosen=_in_front(found.chosen, y))
+        if len(chosen := _in_front(found.chosen, y)) < len(found.chosen):
+            found = replace(found, chosen=chosen)
         estimate.trigger = [seen for seen in estimate.trigger if abs(sight.t_s - seen[0]) < ONE_TRIGGER_S]
         estimate.evidence += found.evidence
         estimate.evidence_by[observer] += found.evidence

@@ -70,31 +70,33 @@ class Shaking:
         return Shaking(np.minimum(np.maximum(self.logs + step, LEAST), MOST), information)
 
 
-def kept_share(span_s: float) -> float:
+def kept_share(span_s: float | Floats) -> Floats:
     """Give the share of the shaking at one time that is left span_s later."""
-    return math.exp(-span_s / SHAKEN_S)
+    return np.asarray(np.exp(-np.asarray(span_s) / SHAKEN_S))
 
 
-def shaking_noise(R: Floats, variances: Floats, span_s: float) -> Floats:
+def shaking_noise(R: Floats, variances: Floats, span_s: float | Floats) -> Floats:
     """Give what shaking of these variances (3,) adds to the plain errors' covariance in a step, (3, MOVING, MOVING).
 
-    R (2, 3, 3): attitudes at the end. A unit's angle goes from q to a q + n, and the camera's attitude with it the
-    other way: phi -= R n. The velocity likewise, and the place by what it has been meanwhile, m, with
+    R (2, 3, 3): attitudes at the end. All may have leading axes, for a batch of steps. A unit's angle goes from q to
+    a q + n, and the camera's attitude with it the other way: phi -= R n. The velocity likewise, and the place by what
+    it has been meanwhile, m, with
     var n = s^2 (1 - a^2), cov(m, n) = s^2 t (1 - a)^2, var m = s^2 t^2 (2 h / t - 3 + 4 a - a^2).
     """
-    a, t = kept_share(span_s), SHAKEN_S
-    out = np.zeros((3, MOVING, MOVING))
-    fresh = 1.0 - a * a
+    a, t, h = kept_share(span_s), SHAKEN_S, np.asarray(span_s)
+    out = np.zeros((*R.shape[:-3], 3, MOVING, MOVING))
+    by_axis = variances[..., None, None] * _IDENTITY
+    fresh = (1.0 - a * a)[..., None, None]
     for node in (0, 1):
-        of_node, q = out[node], float(variances[node]) * fresh
-        of_node[PHI[node], PHI[node]] = of_node[SHAKE[node], SHAKE[node]] = q * _IDENTITY
-        of_node[PHI[node], SHAKE[node]] = -q * R[node]
-        of_node[SHAKE[node], PHI[node]] = -q * R[node].T
-    q, s = float(variances[2]), out[2]
-    s[V_, V_] = s[SHOVE, SHOVE] = q * fresh * _IDENTITY
-    s[V_, SHOVE] = s[SHOVE, V_] = -q * fresh * _IDENTITY
-    both = q * t * (1.0 - a) ** 2 * _IDENTITY
-    s[R_, V_] = s[V_, R_] = both
-    s[R_, SHOVE] = s[SHOVE, R_] = -both
-    s[R_, R_] = q * t * t * max(2.0 * span_s / t - 3.0 + 4.0 * a - a * a, 0.0) * _IDENTITY
+        of_node, q = out[..., node, :, :], by_axis[..., node, :, :] * fresh
+        of_node[..., PHI[node], PHI[node]] = of_node[..., SHAKE[node], SHAKE[node]] = q
+        of_node[..., PHI[node], SHAKE[node]] = across = -q @ R[..., node, :, :]
+        of_node[..., SHAKE[node], PHI[node]] = np.swapaxes(across, -1, -2)
+    s, q = out[..., 2, :, :], by_axis[..., 2, :, :]
+    s[..., V_, V_] = s[..., SHOVE, SHOVE] = drawn = q * fresh
+    s[..., V_, SHOVE] = s[..., SHOVE, V_] = -drawn
+    both = q * (t * (1.0 - a) ** 2)[..., None, None]
+    s[..., R_, V_] = s[..., V_, R_] = both
+    s[..., R_, SHOVE] = s[..., SHOVE, R_] = -both
+    s[..., R_, R_] = q * (t * t * np.maximum(2.0 * h / t - 3.0 + 4.0 * a - a * a, 0.0))[..., None, None]
     return out

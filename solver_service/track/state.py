@@ -35,6 +35,7 @@ _ENDS: Final = np.cumsum([math.prod(shape) for shape in _SHAPES]).tolist()
 _PARTS: Final = list(zip([0, *_ENDS], _ENDS, _SHAPES, strict=False))
 ROW: Final = _ENDS[-1]
 _THREE: Final = 3.0 * np.eye(3)
+_STILL: Final[Floats] = np.eye(MOVING)
 _OF_PLACE: Final = np.r_[R_, PHI[0], PHI[1]]
 _PLACE: Final = np.ix_(_OF_PLACE, _OF_PLACE)
 
@@ -70,14 +71,15 @@ class State:
         R_A = exp(phi_A) R_A, R_B = exp(phi_A) exp(psi) R_B with psi = phi_B - phi_A, v = exp(phi_A) (v + dv), shove
         likewise, r = exp(phi_A) (exp(psi) r + J(psi) dr): A turns all, and B goes by the screw (psi, dr) against it.
         Turning all about the vertical changes nothing that pictures show, and where one node alone is seen, what they
-        leave open stays on its circle, however large it is (docs/track.md, consistency).
+        leave open stays on its circle, however large it is (docs/track.md, consistency). What rounding does to R is
+        mended by the next step (strapdown.integrate).
         """
         psi = error[PHI[1]] - error[PHI[0]]
         turn = rotation_exp(np.array((error[PHI[0]], psi)))
         return State(
             r_m=turn[0] @ (turn[1] @ self.r_m + left_jacobian(psi) @ error[R_]),
             v_mps=turn[0] @ (self.v_mps + error[V_]),
-            R=orthonormal(turn[0] @ np.array((self.R[0], turn[1] @ self.R[1]))),
+            R=turn[0] @ np.array((self.R[0], turn[1] @ self.R[1])),
             shake_rad=self.shake_rad + error[12:18].reshape(2, 3),
             shove_mps=turn[0] @ (self.shove_mps + error[SHOVE]),
             gyro_bias_radps=self.gyro_bias_radps + error[21:27].reshape(2, 3),
@@ -111,8 +113,11 @@ class State:
         return error
 
     def to_row(self) -> Floats:
-        """Return all numbers as one row (ROW,)."""
-        return np.concatenate([np.ravel(part) for part in vars(self).values()])
+        """Return all numbers as one row (ROW,), of a batch as rows (..., ROW)."""
+        if self.r_m.ndim == 1:
+            return np.concatenate([np.ravel(part) for part in vars(self).values()])
+        lead = self.r_m.shape[:-1]
+        return np.concatenate([np.reshape(part, (*lead, -1)) for part in vars(self).values()], axis=-1)
 
     @classmethod
     def of_row(cls, rows: Floats) -> State:
@@ -134,15 +139,20 @@ def orthonormal(R: Floats) -> Floats:
 
 def plain_of_invariant(state: State) -> Floats:
     """Give T (MOVING, MOVING): errors with plain r_true - r, v_true - v and shove likewise, from the state's own."""
-    T = np.eye(MOVING)
-    T[R_, PHI[1]], T[V_, PHI[0]], T[SHOVE, PHI[0]] = -skew(np.array((state.r_m, state.v_mps, state.shove_mps)))
-    return T
+    return _turned_with(state, -1.0)
 
 
 def invariant_of_plain(state: State) -> Floats:
     """Give the inverse of `plain_of_invariant`."""
-    T = np.eye(MOVING)
-    T[R_, PHI[1]], T[V_, PHI[0]], T[SHOVE, PHI[0]] = skew(np.array((state.r_m, state.v_mps, state.shove_mps)))
+    return _turned_with(state, 1.0)
+
+
+def _turned_with(state: State, sign: float) -> Floats:
+    """Give both, of a batch of states with its leading axes."""
+    across = skew(sign * np.array((state.r_m, state.v_mps, state.shove_mps)))
+    T = np.empty((*state.r_m.shape[:-1], MOVING, MOVING))
+    T[...] = _STILL
+    T[..., R_, PHI[1]], T[..., V_, PHI[0]], T[..., SHOVE, PHI[0]] = across
     return T
 
 

@@ -116,7 +116,7 @@ class TrackSteps(TrackSights):
         times_s = list(step)
         for t_s, _, _, what in heapq.nsmallest(3 * self._together, self._events):
             if isinstance(what, Sight) and t_s - times_s[-1] >= TOGETHER_S:
-                while t_s - times_s[-1] > 1.5 * TICK_S:
+                while t_s - times_s[-1] > 1.5 * TICK_S and len(times_s) <= self._together:
                     times_s.append(times_s[-1] + TICK_S)
                 times_s.append(t_s)
         return times_s[: self._together + 1]

@@ -271,42 +271,47 @@ def kept_shares(without: Bools, noises: tuple[Noise, Noise], span_s: float) -> F
     return np.where(without, swings, kept_share(span_s))
 
 
-def propagate(state: State, parts: Increments, span_s: float, shares: Floats | None = None) -> tuple[State, Floats]:
+def propagate(
+    state: State, parts: Increments, span_s: float | Floats, shares: Floats | None = None
+) -> tuple[State, Floats]:
     """Move the state by both nodes' increments; return it and the rows (MOVING, SIZE) of its transition that are not 1.
 
     The errors are those of `State.plus`, at both ends. What the units were shaken by at the start is in the increments;
     a share of it is still there at the end (shaking.py). shares (2,): of the angles, as `kept_shares` gives them; 0
-    where an angle has nothing to do with what it was. By default both nodes have a unit.
+    where an angle has nothing to do with what it was. By default both nodes have a unit. A batch of states has leading
+    axes, and so have increments, spans and shares.
     """
-    kept = kept_share(span_s)
-    kept_angle = np.full(2, kept) if shares is None else shares
-    dv, dp = parts.dv_mps[1] - parts.dv_mps[0], parts.dp_m[1] - parts.dp_m[0]
-    gone, back_s = 1.0 - kept, span_s - SHAKEN_S * (1.0 - kept)
+    span = np.asarray(span_s)[..., None]
+    kept = kept_share(span)
+    kept_angle = np.repeat(kept, 2, axis=-1) if shares is None else shares
+    dv, dp = (moved[..., 1, :] - moved[..., 0, :] for moved in (parts.dv_mps, parts.dp_m))
     # Without a unit nothing is shaken.
     felt = (~parts.without & (kept_angle > 0.0)).astype(np.float64)
-    shake = felt[:, None] * state.shake_rad
-    shove = felt.max() * state.shove_mps
-    off = rotation_exp((state.R @ shake[:, :, None])[:, :, 0])
-    R = off @ parts.R @ rotation_exp(-kept_angle[:, None] * shake)
+    any_felt = felt.max(axis=-1, keepdims=True)
+    gone, back_s = any_felt * (1.0 - kept), any_felt * (span - SHAKEN_S * (1.0 - kept))
+    shake = felt[..., None] * state.shake_rad
+    off = rotation_exp((state.R @ shake[..., None])[..., 0])
+    R = off @ parts.R @ rotation_exp(-kept_angle[..., None] * shake)
     after = replace(
         state,
-        r_m=state.r_m + state.v_mps * span_s + back_s * shove + dp,
-        v_mps=state.v_mps + gone * shove + dv,
+        r_m=state.r_m + state.v_mps * span + back_s * state.shove_mps + dp,
+        v_mps=state.v_mps + gone * state.shove_mps + dv,
         R=R,
-        shake_rad=kept_angle[:, None] * state.shake_rad,
+        shake_rad=kept_angle[..., None] * state.shake_rad,
         shove_mps=kept * state.shove_mps,
     )
-    F = np.zeros((MOVING, SIZE))
-    F[_ROWS, _COLUMNS] = _SIGNS * parts.jacobian
-    F[R_, R_] = F[V_, V_] = _IDENTITY
-    F[R_, V_] = span_s * _IDENTITY
-    F[R_, SHOVE] = felt.max() * back_s * _IDENTITY
-    F[V_, SHOVE] = felt.max() * gone * _IDENTITY
-    F[SHOVE, SHOVE] = kept * _IDENTITY
+    F = np.zeros((*parts.without.shape[:-1], MOVING, SIZE))
+    F[..., _ROWS, _COLUMNS] = _SIGNS * parts.jacobian
+    F[..., R_, R_] = F[..., V_, V_] = _IDENTITY
+    F[..., R_, V_] = span[..., None] * _IDENTITY
+    F[..., R_, SHOVE] = back_s[..., None] * _IDENTITY
+    F[..., V_, SHOVE] = gone[..., None] * _IDENTITY
+    F[..., SHOVE, SHOVE] = kept[..., None] * _IDENTITY
+    swung = felt[..., None, None] * (state.R - kept_angle[..., None, None] * R)
     for node in (0, 1):
-        F[PHI[node], SHAKE[node]] = felt[node] * (state.R[node] - kept_angle[node] * R[node])
-        F[SHAKE[node], SHAKE[node]] = kept_angle[node] * _IDENTITY
-    F[:, :MOVING] = F[:, :MOVING] @ plain_of_invariant(state)
+        F[..., PHI[node], SHAKE[node]] = swung[..., node, :, :]
+        F[..., SHAKE[node], SHAKE[node]] = kept_angle[..., node, None, None] * _IDENTITY
+    F[..., :MOVING] = F[..., :MOVING] @ plain_of_invariant(state)
     return after, invariant_of_plain(after) @ F
 
 
@@ -327,30 +332,61 @@ def process_noise(
     """Give what a step adds to the covariance: of the moving errors (MOVING, MOVING), and of each other error
     (SIZE-MOVING,); and the parts in the first that shaking of the variances (3,) adds, (3, MOVING, MOVING).
     shares (2,): as `propagate` takes them."""
-    Q = np.zeros((MOVING, MOVING))
-    without = parts.without.tolist()
-    walk = np.zeros(SIZE)
-    force = 0.0
-    for node, (gap_s, noise) in enumerate(zip(parts.gap_s.tolist(), noises, strict=True)):
-        force += noise.accel_mps**2 * span_s
-        walk[ACCEL_BIAS[node]] = noise.accel_bias_mps2**2 * span_s
-        if not without[node]:
-            force += noise.gap_accel_mps**2 * gap_s
-            turn = noise.gyro_rad**2 * span_s + noise.gap_gyro_rad**2 * gap_s
-            Q[PHI[node], PHI[node]] = turn * _IDENTITY
-            walk[GYRO_BIAS[node]] = noise.gyro_bias_radps**2 * span_s
+    guessed = guessed_noise(parts, noises, span_s, shares).sum(axis=0) if parts.without.any() else None
+    return noise_of_steps(after, parts, sampled(noises), shaking, span_s, guessed)
+
+
+def sampled(noises: tuple[Noise, Noise]) -> Floats:
+    """Give the densities (6, 2) of nodes that have units: of rates, forces, both in gaps, and both biases' walks."""
+    a, b = noises
+    return np.array(
+        (
+            (a.gyro_rad, b.gyro_rad),
+            (a.accel_mps, b.accel_mps),
+            (a.gap_gyro_rad, b.gap_gyro_rad),
+            (a.gap_accel_mps, b.gap_accel_mps),
+            (a.gyro_bias_radps, b.gyro_bias_radps),
+            (a.accel_bias_mps2, b.accel_bias_mps2),
+        )
+    )
+
+
+def noise_of_steps(
+    after: State,
+    parts: Increments,
+    densities: Floats,
+    shaking: Floats,
+    span_s: float | Floats,
+    guessed: Floats | None = None,
+) -> tuple[Floats, Floats, Floats]:
+    """Give what `process_noise` does; all may have leading axes, for a batch of steps.
+
+    densities (6, 2): as `sampled` gives them, of a batch (6, ..., 2). guessed (SIZE, SIZE): what nodes without a unit
+    add, None where all have one.
+    """
+    span, felt = np.asarray(span_s)[..., None], ~parts.without
+    gyro, accel, gap_gyro, gap_accel, gyro_walk, accel_walk = densities * densities
+    turn = felt * (gyro * span + gap_gyro * parts.gap_s)
+    force = np.add.reduce(accel * span + felt * gap_accel * parts.gap_s, axis=-1)
+    Q = np.zeros((*felt.shape[:-1], MOVING, MOVING))
+    for node in (0, 1):
+        Q[..., PHI[node], PHI[node]] = turn[..., node, None, None] * _IDENTITY
     _accelerated(Q, force, span_s)
-    if any(without):
-        whole = guessed_noise(parts, noises, span_s, shares).sum(axis=0)
-        Q += whole[:MOVING, :MOVING]
-        walk += np.diag(whole) * _CONSTANT
+    walk = np.zeros((*felt.shape[:-1], SIZE))
+    for biases, walked in ((GYRO_BIAS, felt * gyro_walk * span), (ACCEL_BIAS, accel_walk * span)):
+        walk[..., biases[0]], walk[..., biases[1]] = walked[..., :1], walked[..., 1:]
+    if guessed is not None:
+        Q += guessed[..., :MOVING, :MOVING]
+        walk += np.diagonal(guessed, axis1=-2, axis2=-1) * _CONSTANT
     shaken = shaking_noise(after.R, shaking, span_s)
-    for k, still in enumerate((*without, all(without))):
-        if still:
-            shaken[k, :NAV] = shaken[k, :, :NAV] = 0.0
+    if parts.without.any():
+        still = np.concatenate((parts.without, parts.without.all(axis=-1, keepdims=True)), axis=-1)
+        shaken[still, :NAV] = 0.0
+        shaken[still, :, :NAV] = 0.0
     T = invariant_of_plain(after)
-    shaken = T @ shaken @ T.T
-    return T @ Q @ T.T + np.add.reduce(shaken), walk[MOVING:], shaken
+    back = np.swapaxes(T, -1, -2)
+    shaken = T[..., None, :, :] @ shaken @ back[..., None, :, :]
+    return T @ Q @ back + np.add.reduce(shaken, axis=-3), walk[..., MOVING:], shaken
 
 
 def guessed_noise(parts: Increments, noises: tuple[Noise, Noise], span_s: float, shares: Floats) -> Floats:
@@ -373,11 +409,12 @@ def guessed_noise(parts: Increments, noises: tuple[Noise, Noise], span_s: float,
     return guessed
 
 
-def _accelerated(Q: Floats, force: float, span_s: float) -> None:
+def _accelerated(Q: Floats, force: float | Floats, span_s: float | Floats) -> None:
     """Enter what a velocity's walk, of a variance (m/s)^2 by the step's end, adds to a covariance."""
-    Q[V_, V_] = force * _IDENTITY
-    Q[R_, V_] = Q[V_, R_] = 0.5 * span_s * force * _IDENTITY
-    Q[R_, R_] = span_s * span_s / 3.0 * force * _IDENTITY
+    span, walked = np.asarray(span_s)[..., None, None], np.asarray(force)[..., None, None] * _IDENTITY
+    Q[..., V_, V_] = walked
+    Q[..., R_, V_] = Q[..., V_, R_] = 0.5 * span * walked
+    Q[..., R_, R_] = span * span / 3.0 * walked
 
 
 def predicted(P: Floats, F: Floats, Q: Floats, walk: Floats) -> Floats:

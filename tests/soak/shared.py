@@ -44,6 +44,10 @@ START_NS = 1_764_000_000_000_000_000
 REST_S = 60.0
 # From a kill to the start of another solver.
 TAKEN_UP_S = 3.0
+# For how long a dive goes on beside what is measured in it: until the first solvers have told of all pairs, and until
+# one that was started after a kill is there.
+BEGUN_S = 20.0
+JOINED_S = 6.0
 
 
 def simulated(nodes: int, rate_hz: float, seconds: float, *, imu: bool, teams: int = 1) -> list[Message]:
@@ -114,12 +118,14 @@ def _longest(came: list[float], start_s: float, end_s: float) -> float:
 class LiveDive:
     """Sends a dive as if it happened now, again and again, and takes what solvers tell.
 
-    expected: by pair, all triggers so far.
+    expected: by pair, all triggers so far. again: how often it has begun again. All nodes are then elsewhere at once,
+    and all tracks break: what is measured over such a jump is of no dive.
     """
 
     def __init__(self, bus: Bus, messages: list[Message], rate_hz: float) -> None:
         self.told = SolversTold()
         self.expected: set[tuple[str, str, int]] = set()
+        self.again = 0
         self._messages, self._period_ns = messages, round(S_NS / rate_hz)
         self._nodes = sorted({one.node for one in messages})
         said = {(topic_of(one), one.node) for one in messages}
@@ -157,11 +163,15 @@ class LiveDive:
                     self.expected |= {(*sorted((one.node, other)), one.trigger) for other in others}
                 self._publishers[topic_of(one), one.node].put(one)
             later += span
+            self.again += 1
 
 
 @dataclass
 class SharedSoak:
-    """How it went. gaps_s: longest time without an outcome after each kill; joined_s: as another solver joins."""
+    """How it went. gaps_s: longest time without an outcome after each kill; joined_s: as another solver joins.
+
+    jumps: how often the dive began again, with all nodes elsewhere.
+    """
 
     triggers: int
     missing: int
@@ -172,6 +182,7 @@ class SharedSoak:
     net_rows: int
     late_s: dict[str, tuple[float, float, float]]
     cores: dict[str, float]
+    jumps: int
 
 
 def soak(
@@ -191,7 +202,8 @@ def soak(
 
     track_hz: 0 for neither tracks nor net. How late things come and what processes take is of those seconds.
     """
-    messages = simulated(nodes, rate_hz, 20.0, imu=track_hz > 0, teams=teams)
+    lasts_s = BEGUN_S + again_s + seconds + kills * (1.0 + TAKEN_UP_S + JOINED_S + again_s)
+    messages = simulated(nodes, rate_hz, lasts_s, imu=track_hz > 0, teams=teams)
     config = work / "solver.toml"
     config.write_text(f'share = true\njournal = "{work / "answered"}"\n[track]\nrate_hz = {track_hz}\n')
     pick = random.Random(seed)
@@ -231,6 +243,7 @@ def soak(
                     time.sleep(again_s)
                     joined_s.append(dive.told.longest_gap_s(again, time.monotonic()))
                 dive.end()
+                jumps = dive.again
                 due = set(dive.expected)
                 ends_s = time.monotonic() + REST_S
                 while not due <= dive.told.outcomes.keys() and time.monotonic() < ends_s:
@@ -249,6 +262,7 @@ def soak(
         net_rows=len(dive.told.net),
         late_s=late_s,
         cores=cores,
+        jumps=jumps,
     )
 
 
@@ -306,6 +320,8 @@ def main() -> int:
         f"{len(found.gaps_s)} kills among {args.solvers}: of {found.triggers} outcomes {found.missing} missing, "
         f"{found.doubled} doubled"
     )
+    if found.jumps:
+        print(f"the dive was too short: {found.jumps} times all nodes jumped back to its beginning")
     if found.gaps_s:
         gaps, joined = (
             f"median {statistics.median(of):.2f} s, worst {max(of):.2f} s" for of in (found.gaps_s, found.joined_s)

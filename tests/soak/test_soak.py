@@ -29,7 +29,7 @@ def children(pid):
 
 @pytest.mark.slow
 def test_a_soak_that_is_asked_to_end_leaves_no_process():
-    words = ["tests.soak.shared", "--kills", "0", "--nodes", "2", "--rate", "2", "--track", "0", "--seconds", "600"]
+    words = ["tests.soak.shared", "--kills", "0", "--nodes", "2", "--rate", "2", "--track", "0", "--seconds", "60"]
     with subprocess.Popen([sys.executable, "-m", *words], cwd=REPOSITORY) as running:
         until(lambda: len(children(running.pid)) == 4, 0.1)
         begun = children(running.pid)

@@ -9,7 +9,7 @@ from buddyline.protocol.codec import decode, encode
 from buddyline.protocol.local_bus import LocalNetwork, LocalPublisher
 from buddyline.protocol.messages import Candidates, Rejected
 from buddyline.protocol.topics import CANDIDATES, key_of, parse_key
-from buddyline.solver_service import service as service_module
+from buddyline.solver_service import owed
 from buddyline.solver_service.answered import Answered, AnsweredPair, answer_of
 from buddyline.solver_service.config import SolverConfig
 from buddyline.solver_service.core import SolverCore
@@ -195,7 +195,7 @@ def test_what_a_killed_solver_could_not_tell_the_next_one_tells(tmp_path, monkey
             until(lambda: outcomes)
             heard = len(outcomes)
         deaf = False
-        monkeypatch.setattr(service_module, "OWED_S", 0.0)
+        monkeypatch.setattr(owed, "OWED_S", 0.0)
         for _ in range(3):
             with network.connect() as bus:
                 service = solver(bus)
@@ -247,7 +247,7 @@ def test_what_waited_when_a_solver_was_killed_has_an_outcome(tmp_path, monkeypat
             nodes_and_solver(bus, frames[: 2 * third], stuck_from=third)
         with network.connect() as bus:
             nodes_and_solver(bus, frames[2 * third :], stuck_from=len(frames) - 2 * third)
-        monkeypatch.setattr(service_module, "OWED_S", 0.0)
+        monkeypatch.setattr(owed, "OWED_S", 0.0)
         for _ in range(2):
             with network.connect() as bus:
                 service = SolverService(config, clock=clock)
@@ -264,7 +264,7 @@ def test_what_waited_when_a_solver_was_killed_has_an_outcome(tmp_path, monkeypat
 
 def test_what_has_come_again_is_not_given_up_while_it_waits(tmp_path, monkeypatch):
     """A solver on a busy machine takes longer than OWED_S to come to the frames that it has received."""
-    monkeypatch.setattr(service_module, "OWED_S", 0.0)
+    monkeypatch.setattr(owed, "OWED_S", 0.0)
     messages, _ = dive_messages(seconds=4.0, period_ns=2 * PERIOD_NS)
     frames = [one for one in messages if isinstance(one, Candidates)]
     last_ns = max(frame.stamp_ns for frame in frames)

@@ -9,9 +9,8 @@ from buddyline.protocol.codec import encode
 from buddyline.protocol.messages import Candidates, Rejected
 from buddyline.protocol.topics import key_of
 from buddyline.solver_service import journal
-from buddyline.solver_service.answered import Answered, answer_of
+from buddyline.solver_service.answered import Answered, answer_of, said_of
 from buddyline.solver_service.journal import Journal
-from buddyline.solver_service.service import _said_of
 
 NOW_NS = 10**18
 
@@ -30,7 +29,7 @@ def frame(trigger, ago_s=1):
 
 
 def kept(path):
-    return {(one.node_a, one.node_b): one.trigger for one in _said_of([], Journal(path).read(NOW_NS).said)}
+    return {(one.node_a, one.node_b): one.trigger for one in said_of([], Journal(path).read(NOW_NS).said)}
 
 
 def test_the_last_outcome_of_each_pair_is_read_back(tmp_path):
@@ -111,7 +110,7 @@ def test_it_stays_small(tmp_path, monkeypatch):
 def test_what_it_says_is_not_answered_again(tmp_path):
     path = tmp_path / "solver.answered"
     Journal(path).add([outcome(7), outcome(9, reason="late")])
-    answered = Answered(_said_of([], Journal(path).read(NOW_NS).said))
+    answered = Answered(said_of([], Journal(path).read(NOW_NS).said))
     said = [outcome(6), outcome(7), outcome(8), outcome(9, reason="late"), outcome(9)]
     assert answered.unsaid(said) == [said[2]]
 
@@ -121,9 +120,9 @@ def test_the_journal_goes_on_from_what_the_hub_holds_unless_that_is_another_solv
         return answer_of(outcome(trigger, pair))
 
     noted = [answer(5), answer(6), answer(7)]
-    assert _said_of([answer(6), answer(4)], noted) == [answer(7)]
-    assert _said_of([answer(9), answer(8)], noted) == [answer(9), answer(8)]
-    assert _said_of([answer(9, ("a", "c"))], noted) == [answer(7), answer(9, ("a", "c"))]
+    assert said_of([answer(6), answer(4)], noted) == [answer(7)]
+    assert said_of([answer(9), answer(8)], noted) == [answer(9), answer(8)]
+    assert said_of([answer(9, ("a", "c"))], noted) == [answer(7), answer(9, ("a", "c"))]
 
 
 def test_a_place_that_cannot_be_written_is_said_once(tmp_path, caplog):

@@ -89,7 +89,6 @@ def test_messages_that_wait_are_solved_together_and_give_the_same(dive, monkeypa
     monkeypatch.setattr(
         service_module.SolverCore, "handle_many", lambda core, *args: calls.append(1) or handle(core, *args)
     )
-    monkeypatch.setattr(service_module, "GATHER_S", 1e9)
     for waiting in (0, 1):
         bus, clock = Capture(), ManualClock()
         service = SolverService(SolverConfig(nodes=["a", "b"]), clock=clock)
@@ -108,8 +107,7 @@ def test_messages_that_wait_are_solved_together_and_give_the_same(dive, monkeypa
     assert len(said[0]) > 20
 
 
-def test_what_waits_when_the_solver_ends_is_solved(dive, monkeypatch):
-    monkeypatch.setattr(service_module, "GATHER_S", 1e9)
+def test_what_waits_when_the_solver_ends_is_solved(dive):
     bus, clock = Capture(), ManualClock()
     service = SolverService(SolverConfig(nodes=["a", "b"]), clock=clock)
     service.attach(bus)
@@ -123,9 +121,8 @@ def test_what_waits_when_the_solver_ends_is_solved(dive, monkeypatch):
     assert {one.trigger for one in outcomes_of(bus)} == triggers
 
 
-def test_a_node_without_lamps_whose_frames_came_first_ends_no_solver(dive, monkeypatch):
+def test_a_node_without_lamps_whose_frames_came_first_ends_no_solver(dive):
     """Frames of a and b form a pair; what says that b has a camera alone waits behind them."""
-    monkeypatch.setattr(service_module, "GATHER_S", 1e9)
     bus, clock = Capture(), ManualClock()
     service = SolverService(SolverConfig(), clock=clock)
     service.attach(bus)
@@ -143,9 +140,8 @@ def test_a_node_without_lamps_whose_frames_came_first_ends_no_solver(dive, monke
 
 
 @pytest.mark.parametrize("nodes", [2, CROWD])
-def test_a_solver_that_cannot_keep_up_says_so_and_in_a_crowd_solves_less(dive, nodes, monkeypatch):
+def test_a_solver_that_cannot_keep_up_says_so_and_in_a_crowd_solves_less(dive, nodes):
     """The frames of each node wait for four seconds in it, until the queue is empty."""
-    monkeypatch.setattr(service_module, "GATHER_S", 0.0)
     bus, clock = Capture(), ManualClock()
     service = SolverService(SolverConfig(), clock=clock)
     service.attach(bus)
@@ -163,7 +159,7 @@ def test_a_solver_that_cannot_keep_up_says_so_and_in_a_crowd_solves_less(dive, n
 
     for message in infos + slow:
         receive(message, 4 * S_NS)
-    service._take_all()
+        service._take_all()
     service.report()
     (problem,) = {m.problem for m in bus.published if isinstance(m, SolverStatus)}
     assert "the solver is 4 s behind" in problem
@@ -180,5 +176,5 @@ def test_a_solver_that_cannot_keep_up_says_so_and_in_a_crowd_solves_less(dive, n
     pairs = nodes * (nodes - 1) // 2
     assert Counter(one.trigger for one in told) == {frame.trigger: pairs for frame in frames}
     left_out = {one.trigger for one in told if isinstance(one, Rejected) and one.detail == NO_TIME}
-    assert left_out <= {frame.trigger for frame in slow if frame.trigger % LOOKS}
+    assert left_out <= {frame.trigger for frame in slow if frame.trigger % (LOOKS * LOOKS)}
     assert bool(left_out) is (nodes == CROWD)

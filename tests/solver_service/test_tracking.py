@@ -1,11 +1,12 @@
 """The track as messages: the same in any order of arrival, honest against truth, none where nothing is known."""
 
 import random
+from itertools import groupby
 
 import numpy as np
 import pytest
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.messages import Candidates, Depth, Imu, NodeInfo, Rejected, RelativePose, Track
+from buddyline.protocol.messages import Candidates, Depth, Expect, Imu, NodeInfo, Rejected, RelativePose, Track
 from buddyline.protocol.topics import TRACK, TRACK_LAG, key_of
 from buddyline.solver_service import core, tracking
 from buddyline.solver_service.core import SolverCore
@@ -16,6 +17,7 @@ from buddyline.solver_service.tracking import PairTracker, TrackSettings
 from msgspec import UNSET
 from msgspec.structs import replace
 
+from tests.soak.shared import simulated
 from tests.solver_service.conftest import dive_messages
 
 
@@ -208,6 +210,31 @@ def test_one_of_many_pairs_has_no_track_before_its_first_pose(crowded):
     assert any(found) is not crowded
 
 
+def told_of_a_and_b(messages, chosen=None):
+    settings = TrackSettings(frozenset(("filter", "lag")), expect=True)
+    solver = SolverCore(Settings(), chosen, track=settings)
+    told = []
+    for _, together in groupby(messages, lambda one: one.stamp_ns * 20 // S_NS):
+        told += solver.handle_many(together)
+    tracks = [one for one in told if isinstance(one, Track) and (one.node_a, one.node_b) == ("a", "b")]
+    return tracks, [one for one in told if isinstance(one, Expect) and {one.node, one.seen} == {"a", "b"}]
+
+
+@pytest.mark.parametrize("absurd", [False, True])
+def test_pairs_are_told_of_together_as_each_alone(monkeypatch, absurd):
+    """To the last bit; also where the values of one are out of numeric range, so that all are told of one by one."""
+    messages = simulated(3, 10.0, 4.0, imu=True)
+    alone = told_of_a_and_b([one for one in messages if one.node in "ab"], [("a", "b")])
+    assert all(len(each) > 20 for each in alone)
+    if absurd:
+
+        def fails(*_):
+            raise ArithmeticError
+
+        monkeypatch.setattr(tracking, "work_out", fails)
+    assert told_of_a_and_b(messages) == alone
+
+
 def test_a_track_goes_on_after_absurd_values(inertial_dive):
     messages, _ = inertial_dive
     half = len(messages) // 2
@@ -229,7 +256,7 @@ def test_only_what_absurd_values_lead_to_begins_the_track_anew(monkeypatch, mode
         def fails(*_):
             raise error
 
-        owner, name = (TrackFilter, "advance") if mode == "filter" else (tracking, "smooth")
+        owner, name = (TrackFilter, "coming") if mode == "filter" else (tracking, "smooth")
         monkeypatch.setattr(owner, name, fails)
 
     fail_with(np.linalg.LinAlgError("Singular matrix"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -143,6 +143,19 @@ def tum(messages: list[Message], path: Path) -> Iterator[tuple[str, Any, Any]]:
         yield "pose", [float(word) for word in words[1:]], [*told.t_a_b_m, *told.q_a_b_xyzw]
 
 
+def uncertainty(axes: Sequence[str], covariance: Any) -> dict[str, float]:
+    """The columns of a covariance (6, 6): standard deviations, and the upper triangle."""
+    found = {f"sd_{axis}_{'m' if i < 3 else 'rad'}": math.sqrt(covariance[i, i]) for i, axis in enumerate(axes)}
+    return found | {f"cov_{axis}_{axes[k]}": covariance[i, k] for i, axis in enumerate(axes) for k in range(i, 6)}
+
+
+def told_in(row: dict[str, Any], named: dict[str, str], expected: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    assert {name: row[name] for name in named} == named
+    assert set(row) == {*expected, *named}
+    for name, value in expected.items():
+        yield name, float(row[name]) if name != "stamp_ns" else int(row[name]), value
+
+
 def table(messages: list[Message], rows: list[dict[str, Any]]) -> Iterator[tuple[str, Any, Any]]:
     axes = ("x", "y", "z", "wx", "wy", "wz")
     truths = {one.stamp_ns: one for one in of(messages, Truth)}
@@ -166,15 +179,11 @@ def table(messages: list[Message], rows: list[dict[str, Any]]) -> Iterator[tuple
         for name in ("azimuth", "inclination"):
             expected[f"{name}_rad"] = getattr(told, f"{name}_rad")
             expected[f"sd_{name}_rad"] = getattr(told, f"sigma_{name}_rad")
-        for i, axis in enumerate(axes):
-            expected[f"sd_{axis}_{'m' if i < 3 else 'rad'}"] = math.sqrt(covariance[i, i])
-            expected |= {f"cov_{axis}_{axes[k]}": covariance[i, k] for k in range(i, 6)}
-            expected |= {f"cov_v{axis}_v{axes[k]}": of_v[i, k] for k in range(i, 3) if i < 3}
+        expected |= uncertainty(axes, covariance)
+        for i, axis in enumerate(axes[:3]):
+            expected |= {f"cov_v{axis}_v{axes[k]}": of_v[i, k] for k in range(i, 3)}
         named = {"node_a": told.node_a, "node_b": told.node_b, "mode": told.mode}
-        assert {name: row[name] for name in named} == named
-        assert set(row) == {*expected, *named}
-        for name, value in expected.items():
-            yield name, float(row[name]) if name != "stamp_ns" else int(row[name]), value
+        yield from told_in(row, named, expected)
 
 
 def of_csv(messages: list[Message], path: Path) -> Iterator[tuple[str, Any, Any]]:
@@ -366,14 +375,9 @@ def of_nodes(messages: list[Message], rows: list[dict[str, Any]]) -> Iterator[tu
         expected |= {f"{axis}_m": x for axis, x in zip(AXES, told.p_m, strict=True)}
         expected |= {f"v_{axis}_mps": x for axis, x in zip(AXES, told.v_mps, strict=True)}
         expected |= {f"q_{axis}": x for axis, x in zip("xyzw", told.q_xyzw, strict=True)}
-        for i, axis in enumerate(turned):
-            expected[f"sd_{axis}_{'m' if i < 3 else 'rad'}"] = math.sqrt(covariance[i, i])
-            expected |= {f"cov_{axis}_{turned[k]}": covariance[i, k] for k in range(i, 6)}
+        expected |= uncertainty(turned, covariance)
         named = {"net": told.net, "node": told.node, "mode": told.mode}
-        assert {name: row[name] for name in named} == named
-        assert set(row) == {*expected, *named}
-        for name, value in expected.items():
-            yield name, float(row[name]) if name != "stamp_ns" else int(row[name]), value
+        yield from told_in(row, named, expected)
 
 
 def net_csv(messages: list[Message], path: Path) -> Iterator[tuple[str, Any, Any]]:

@@ -5,7 +5,9 @@ import math
 import numpy as np
 import pytest
 from buddyline.solver_service.network.exclusive import share
-from buddyline.solver_service.track.association import associate, weigh
+from buddyline.solver_service.track.association import associate
+
+from tests.solver_service.track.assignments import weigh
 
 P = np.diag([4.0, 4.0])
 CLUTTER = 4 / (820 * 616)

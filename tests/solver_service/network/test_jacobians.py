@@ -81,12 +81,12 @@ def test_lights(pair: tuple[int, int]) -> None:
     observer, other = pair
     state, rates = a_state(3), np.random.default_rng(4).normal(0.0, 0.3, (3, 3))
     dt_s = np.array((-0.004, 0.006))
-    _, D = light_positions(state, observer, other, LIGHTS_M, rates, dt_s)
+    D = light_positions(state, observer, [other], LIGHTS_M[None], rates, dt_s)[1][0]
     whole = np.zeros((*D.shape[:3], 1 + 3 * BLOCK))
     whole[..., columns(observer, other)] = D
 
     def seen(error: Floats) -> Floats:
-        return light_positions(state.plus(error), observer, other, LIGHTS_M, rates, dt_s)[0]
+        return light_positions(state.plus(error), observer, [other], LIGHTS_M[None], rates, dt_s)[0][0]
 
     assert whole == pytest.approx(differences(seen, 1 + 3 * BLOCK), abs=1e-6)
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from buddyline.solver_service.geometry.rotation import Floats
-from buddyline.solver_service.track.association import weigh
 from buddyline.solver_service.track.dive import smooth
 from buddyline.solver_service.track.lights import COLUMNS, Sight
 from buddyline.solver_service.track.parts import parts_of
@@ -15,6 +14,7 @@ from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.smoother import Path, smoothed
 from buddyline.solver_service.track.state import NAV, PHI, R_, SIZE
 
+from tests.solver_service.track.assignments import weigh
 from tests.solver_service.track.dives import KnownDive, Setting, filter_of, make, score
 
 

@@ -11,7 +11,6 @@ import pytest
 from buddyline.node.imu_means import ImuPacker
 from buddyline.protocol.messages import Imu
 from buddyline.solver_service.track import dive as dive_track
-from buddyline.solver_service.track.association import weigh
 from buddyline.solver_service.track.dive import smooth
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import FixSeen
@@ -20,6 +19,7 @@ from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.records import NodeRecord, Records, last_ns, pass_over
 from buddyline.solver_service.track.smoother import Path
 
+from tests.solver_service.track.assignments import weigh
 from tests.solver_service.track.dives import EPOCH_NS, KnownDive, Setting, filter_of, fix_errors, make, score
 
 SHORT = Setting(seconds=12.0)
