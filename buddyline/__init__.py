@@ -129,8 +129,9 @@ def __dir__() -> list[str]:
 def open_dive(*logs: str | Path) -> DiveColumns:
     """Open a stored dive: its log, or each node's own, with poses or without.
 
-    Poses, attitudes, depths, candidates and truth are then numpy columns. What can be read of damaged logs is used;
-    `losses` says what is missing.
+    Its methods give poses, track, attitudes, depths, candidates and truth as numpy columns, in SI units; their classes
+    say shapes and frames. What can be read of damaged logs is used; `losses` says what is missing. Raises
+    BuddylineError where a file is missing or is no dive log.
     """
     from buddyline.tools.columns import DiveColumns
 
@@ -148,12 +149,15 @@ def solve(
     track: str = "smooth",
     track_hz: float = 50.0,
 ) -> SolvedDive:
-    """Solve a stored dive in memory, as `buddyline solve` does; pictures are detected first where need be.
+    """Solve a stored dive in memory, as `buddyline solve` does; pictures without candidates are searched first.
 
-    pair: (a, b) of T_a_b; may be left out where the dive has two nodes. clock_offset_s: B's clock minus A's;
-    None: what the nodes' beacons tell. environment: of the detector. infos: node id to the calibration to use in place
-    of the logs' own. track: the fused estimate, "smooth" over the whole dive, "lag" or "filter" as live, "none" to save
-    the time; track_hz: its rows.
+    pair: (a, b) of T_a_b; may be left out where the dive has two nodes. method: "refined" (least squares from the
+    closed form), "exact" (the closed form alone), or the paper's: "paper", "paper_midpoint", "paper_literal" (Damron
+    et al. 2018, Eq. 1; docs/theory.md). checks: which of "range", "twist", "attitude" and "depth" may reject a pose.
+    clock_offset_s: B's clock minus A's; None: what the nodes' beacons tell. environment: changes nothing for the
+    default detector. infos: node id to the calibration to use in place of the logs' own. track: the fused estimate,
+    "smooth" over the whole dive, "lag" or "filter" as live, "none" to save the time. track_hz: rows a second. Raises
+    BuddylineError for a missing file, an unknown name or a pair that is not there.
     """
     from buddyline.tools.offline import solve_logs
 
@@ -182,7 +186,8 @@ def solve_messages(
 ) -> SolvedDive:
     """Solve messages that a program made itself: NodeInfo and Candidates of both nodes, Imu, Attitude, Depth if any.
 
-    The order must be that of their stamps, within a second. track: as of solve.
+    The order must be that of their stamps, within a second. clock_offset_s: B's clock minus A's. The others as of
+    solve. Raises BuddylineError where the pair, or a node's NodeInfo, is missing.
     """
     from buddyline.tools.offline import solve_messages as solve_in_memory
 
@@ -202,8 +207,11 @@ def detect(
 ) -> list[Blob]:
     """Find the light candidates of one picture, the likeliest first.
 
-    image: (H, W, 3) BGR or (H, W) grey, 8 bit. focal_px: the camera's; give it for a cropped picture.
-    Raises BuddylineError for anything else.
+    image: (H, W, 3) BGR or (H, W) grey, uint8. focal_px: the camera's, which says how large lamps are; None: as of a
+    picture of 49 degrees across, so give it for a crop. method: "source", "paper" or an installed detector;
+    environment: the waters, for "paper" alone. A Blob's place is in px of the distorted picture, pixel centres at
+    integers; its score is the probability of a lamp. Raises BuddylineError for another image, and for an unknown
+    method or environment.
     """
     from buddyline.node.detect import make_detector
 
@@ -211,7 +219,10 @@ def detect(
 
 
 def read_info(path: str | Path) -> NodeInfo:
-    """Read a node's calibration out of a JSON file or the first one of a dive log."""
+    """Read a node's calibration: a NodeInfo as JSON, or the first one in a dive log.
+
+    Raises BuddylineError where the file is missing or has none.
+    """
     from buddyline.tools.dives import load_info
 
     return load_info(str(path))
@@ -226,9 +237,10 @@ def live_poses(
 ) -> LiveStream[RelativePose]:
     """Follow the solver's poses: `with live_poses() as poses: for pose in poses: ...`, until poses.stop().
 
-    connect: the hub's endpoint; default: the one on this machine. config: a TOML file with [tls] (`buddyline keys
-    viewer`). pair: (a, b); default: all. seconds: end after this long; default: never. Raises BuddylineError where
-    no hub answers within five seconds.
+    connect: the hub's endpoint, such as "tcp/192.168.2.1:7447"; default: the one on this machine. config: a TOML file
+    with the hub's endpoint and [tls] (`buddyline keys viewer`). pair: (a, b); default: all. seconds: end after this
+    long; default: never. Each pose is T_a_b with its covariance (protocol/README.md). Raises BuddylineError where no
+    hub answers within five seconds.
     """
     from buddyline.protocol.messages import RelativePose
     from buddyline.protocol.topics import POSE

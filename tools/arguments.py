@@ -60,18 +60,22 @@ def _two_nodes(parser: argparse.ArgumentParser) -> None:
 
 
 def _detector(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--environment", default="auto", help="the waters, for --detector paper; default: auto")
     parser.add_argument(
-        "--environment", default="auto", help="for dives of pictures, with --detector paper; default: auto"
+        "--detector",
+        default="source",
+        help="of dives that have pictures and no candidates: source, paper or an installed one; default: source",
     )
-    parser.add_argument("--detector", default="source", help="for dives of pictures; default: source")
 
 
 def play(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `play`."""
     _dives(parser)
-    parser.add_argument("--speed", type=float, default=1.0, help="1: real time (default); 0: as fast as possible")
-    parser.add_argument("--start", type=float, default=0.0, metavar="S", help="seconds from the dive's start")
-    parser.add_argument("--end", type=float, metavar="S", help="seconds from the dive's start")
+    parser.add_argument("--speed", type=float, default=1.0, help="times real time; 0: as fast as possible; default: 1")
+    parser.add_argument(
+        "--start", type=float, default=0.0, metavar="S", help="begin so many seconds after the dive's start"
+    )
+    parser.add_argument("--end", type=float, metavar="S", help="end so many seconds after the dive's start")
     parser.add_argument("--loop", action="store_true", help="repeat the dive; the times continue")
     add_client_arguments(parser, PLAYER)
 
@@ -106,7 +110,7 @@ def detect(parser: argparse.ArgumentParser) -> None:
         "--environment",
         default="auto",
         choices=PRESETS,
-        help="of the paper's method; `source` adapts by itself; default: auto",
+        help="the waters, for --method paper (`source` adapts by itself); default: auto",
     )
     _method(parser)
     parser.add_argument(
@@ -128,7 +132,9 @@ def after(parser: argparse.ArgumentParser) -> None:
 
 def _method(parser: argparse.ArgumentParser) -> None:
     known = ", ".join(DETECTORS)
-    parser.add_argument("--method", default=DETECTORS[0], help=f"{known}, or an installed one; default: {DETECTORS[0]}")
+    parser.add_argument(
+        "--method", default=DETECTORS[0], help=f"the detector: {known}, or an installed one; default: {DETECTORS[0]}"
+    )
 
 
 def tune(parser: argparse.ArgumentParser) -> None:
@@ -138,11 +144,19 @@ def tune(parser: argparse.ArgumentParser) -> None:
         "--truth", metavar="T.mcap", help="the true places of the lights; default: the dive's own, if it has them"
     )
     _method(parser)
-    parser.add_argument("--environment", default="auto", choices=PRESETS, help="of the paper's method: where to start")
-    parser.add_argument("--fit", action="store_true", help="fit the score, and print it; the pictures show no lamp")
-    parser.add_argument("--fit-sigma", action="store_true", help="fit sigma to simulated pictures, and print it")
+    parser.add_argument(
+        "--environment", default="auto", choices=PRESETS, help="the waters from which --method paper starts"
+    )
+    parser.add_argument(
+        "--fit", action="store_true", help="fit the score's weights, and print them; the pictures must show no lamp"
+    )
+    parser.add_argument(
+        "--fit-sigma", action="store_true", help="fit the candidates' sigmas to simulated pictures, and print them"
+    )
     parser.add_argument("--note", default="", help="with --fit: what the pictures are, for the record")
-    parser.add_argument("--pictures", type=int, default=24, metavar="N", help="at most, evenly spread; default: 24")
+    parser.add_argument(
+        "--pictures", type=int, default=24, metavar="N", help="judge by N at most, evenly spread; default: 24"
+    )
     parser.add_argument(
         "--draw", default="tuned", metavar="DIR", help="new folder for the marked pictures; default: tuned"
     )
@@ -154,8 +168,16 @@ def solve(parser: argparse.ArgumentParser) -> None:
     _dives(parser)
     _new_log(parser, "poses, rejections, and their inputs; must not exist yet")
     _authority(parser)
-    parser.add_argument("--method", choices=METHODS, default=METHODS[0], help="default: %(default)s")
-    parser.add_argument("--checks", default=",".join(CHECKS), help=f"which of {','.join(CHECKS)}; default: all")
+    parser.add_argument(
+        "--method",
+        choices=METHODS,
+        default=METHODS[0],
+        help="the closed form, then refined by least squares; the closed form alone (exact); or the paper's, read in "
+        "three ways; default: %(default)s",
+    )
+    parser.add_argument(
+        "--checks", default=",".join(CHECKS), help=f"which may reject a pose: {','.join(CHECKS)}; default: all"
+    )
     parser.add_argument(
         "--nodes", nargs="+", metavar="NODE", help="solve every pair of these, A B or a,b,c; default: all in the logs"
     )
@@ -164,7 +186,7 @@ def solve(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NODE=FILE",
-        help="a calibration instead of the log's: JSON or log",
+        help="this node's calibration, instead of the log's: JSON or another log; repeatable",
     )
     parser.add_argument(
         "--place",
@@ -185,15 +207,15 @@ def solve(parser: argparse.ArgumentParser) -> None:
         "--attitude-again",
         nargs="*",
         metavar="NODE=FILE.toml",
-        help="attitudes anew from the inertial samples, in both directions of time; with the log's calibration of the "
-        "magnetometer, or a later one in these files",
+        help="compute the attitudes again from the inertial samples, in both directions of time; with the log's "
+        "calibration of the magnetometer, or a later one in these files",
     )
     parser.add_argument(
         "--track",
         choices=TRACKS,
         default=TRACKS[0],
-        help="the fused estimate over time: of the whole dive (smooth), a second late, causal, or none; "
-        "default: %(default)s",
+        help="the fused estimate over time: by the whole dive (smooth), by up to a second later (lag), by what came "
+        "before (filter), or none; default: %(default)s",
     )
     parser.add_argument(
         "--track-hz", type=float, default=50.0, metavar="HZ", help="rows a second; default: %(default)s"
@@ -213,7 +235,7 @@ def align(parser: argparse.ArgumentParser) -> None:
 def evaluate(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `evaluate`."""
     parser.add_argument(
-        "logs", nargs="+", metavar="OUT.mcap", help="the solved log; further logs where it lacks candidates or truth"
+        "logs", nargs="+", metavar="SOLVED.mcap", help="the solved log; further logs where it lacks candidates or truth"
     )
     parser.add_argument("--truth", action="append", default=[], metavar="T.mcap", help="the log with the truth")
     add_pair_argument(parser, "the only one; of several pairs, all nodes of their net")
@@ -268,20 +290,34 @@ def experiments(parser: argparse.ArgumentParser) -> None:
         "--readme", type=Path, metavar="README.md", help="write the main figures into this file, between its markers"
     )
     parser.add_argument(
-        "--tag-video", type=Path, metavar="FILE", help="test_vid.mp4 of github.com/mark-belbin/underwater-apriltags"
+        "--tag-video",
+        type=Path,
+        metavar="FILE",
+        help="also compare AR tags in real water: test_vid.mp4 of github.com/mark-belbin/underwater-apriltags",
     )
 
 
 def plan(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `plan`."""
     shown = "default: %(default)s"
-    parser.add_argument("--baseline", type=float, default=0.88, metavar="M", help=f"spacing of the lights; {shown}")
+    parser.add_argument(
+        "--baseline", type=float, default=0.88, metavar="M", help=f"distance between a node's lights; {shown}"
+    )
     parser.add_argument("--visibility", type=float, metavar="M", help="how far a diver sees; default: no limit")
     parser.add_argument(
-        "--camera", metavar="FILE", help="the node's .toml, or NodeInfo as .json or .mcap; default: 820 px, 48.8 deg"
+        "--camera",
+        metavar="FILE",
+        help="the node's .toml, its NodeInfo as .json, or its log; default: 820 px, 48.8 deg",
     )
-    parser.add_argument("--sigma-px", type=float, metavar="PX", help="noise of a light; default: the camera's, or 0.7")
-    parser.add_argument("--compass-deg", type=float, default=2.0, metavar="DEG", help=f"error of headings; {shown}")
+    parser.add_argument(
+        "--sigma-px",
+        type=float,
+        metavar="PX",
+        help="1 sd of a light's place in a picture; default: the camera's, or 0.7",
+    )
+    parser.add_argument(
+        "--compass-deg", type=float, default=2.0, metavar="DEG", help=f"error of the compasses; {shown}"
+    )
     tolerance = parser.add_argument_group("tolerances, RMS")
     tolerance.add_argument("--range-tolerance", type=float, default=0.10, metavar="M", help=shown)
     tolerance.add_argument("--position-tolerance", type=float, default=0.10, metavar="M", help=shown)
@@ -292,7 +328,7 @@ def plan(parser: argparse.ArgumentParser) -> None:
 
 def export(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `export`."""
-    parser.add_argument("logs", nargs="+", metavar="OUT.mcap", help="the solved log, or one with truth")
+    parser.add_argument("logs", nargs="+", metavar="SOLVED.mcap", help="the solved log, or one with truth")
     parser.add_argument(
         "--format",
         choices=tuple(each.name for each in FORMATS),
@@ -307,7 +343,5 @@ def export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--node", metavar="ID", help="of --what net: this node; tum needs it")
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: standard output")
     parser.add_argument("--truth", action="store_true", help="the true poses instead of the solved ones (tum)")
-    parser.add_argument(
-        "--rejected", action="store_true", help="poses, and rows for triggers without one as well (csv)"
-    )
+    parser.add_argument("--rejected", action="store_true", help="rows for triggers without a pose as well (csv)")
     add_pair_argument(parser, "the only one")

@@ -87,8 +87,13 @@ COMMANDS: Final = (
         ("keys init --hub 192.168.2.1", "keys node a", "keys solver"),
         "tools.installation.keys",
     ),
-    Command("hub", "run the hub that all others connect to", ("hub",)),
-    Command("solver", "run the solver: candidates in, poses and track out", ("solver",), "solver_service.__main__"),
+    Command("hub", "run the hub, through which all others talk", ("hub", "hub --config keys/hub.toml")),
+    Command(
+        "solver",
+        "run the solver: it makes poses and tracks of what the nodes see",
+        ("solver", "solver --config keys/solver.toml"),
+        "solver_service.__main__",
+    ),
     Command("node", "run one node: camera, sensors, detector, log", ("node --config a.toml",), "node.__main__"),
     Command(
         "install-service",
@@ -117,7 +122,7 @@ COMMANDS: Final = (
     Command(
         "calibrate",
         "calibrate camera, lights, magnetometer, gyroscope or clocks, and say whether the result is good",
-        ("calibrate board -o board.pdf", "calibrate camera pictures/", "calibrate clock"),
+        ("calibrate board -o board.pdf", "calibrate camera pictures/ --square-mm 30", "calibrate clock"),
         "tools.calibration.command",
     ),
     Command(
@@ -131,10 +136,10 @@ COMMANDS: Final = (
     Command(
         "monitor",
         "watch running nodes in the browser: scene, cameras, plots, health",
-        ("monitor", "monitor --connect tcp/192.168.2.1:7447 --open"),
+        ("monitor", "monitor --config keys/viewer.toml --open"),
         "tools.monitor.live",
     ),
-    Command("record", "record the bus into a dive log", ("record topside.mcap",)),
+    Command("record", "record all that nodes and solver publish into a dive log", ("record topside.mcap",)),
     Command(
         "mark",
         "name a station or a point of a running dive",
@@ -143,8 +148,8 @@ COMMANDS: Final = (
     ),
     Command(
         "ros2",
-        "show poses, track, pictures, sensors and problems to ROS 2 (rmw_zenoh)",
-        ("ros2", "ros2 --connect tcp/192.168.2.1:7447 --domain 7"),
+        "publish poses, track, pictures, sensors and problems to ROS 2 (rmw_zenoh)",
+        ("ros2", "ros2 --config keys/ros2.toml --domain 7"),
     ),
     Command(
         "bridge",
@@ -157,12 +162,12 @@ COMMANDS: Final = (
     ),
     Command(
         "play",
-        "send stored dives over the bus, as if they happened now",
+        "publish stored dives again, as if they happened now",
         ("play a.mcap b.mcap", "play dive.mcap --speed 4 --start 10 --end 60"),
     ),
     Command(
         "after",
-        "from the nodes' folders to clocks, poses, track and report, all at once after a dive",
+        "after a dive, of the nodes' folders: align the clocks, find poses and track, write the report",
         ("after a/ b/ -o dive/",),
     ),
     Command(
@@ -180,7 +185,7 @@ COMMANDS: Final = (
     ),
     Command(
         "detect",
-        "find light candidates in stored pictures or a dive's pictures",
+        "find what may be lights (candidates) in stored pictures or a dive's pictures",
         ("detect photos/ --draw marked/", "detect dive.mcap -o candidates.mcap"),
     ),
     Command(
@@ -242,7 +247,7 @@ COMMANDS: Final = (
     ),
     Command(
         "experiments",
-        "repeat the paper's figures and numbers, with ours beside them, in one report",
+        "repeat the figures of the paper (Damron et al. 2018), with ours beside them, in one report",
         ("experiments -o report/ --quick", "experiments -o report/ --tag-video test_vid.mp4"),
         "tools.experiments.command",
     ),

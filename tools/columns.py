@@ -79,12 +79,13 @@ class Columns:
 
 @dataclass(frozen=True, eq=False)
 class EstimateColumns(Columns):
-    """Estimates of T_a_b, which maps B's camera frame into A's.
+    """Estimates of T_a_b, which maps B's camera frame into A's (camera frame: x right, y down, z forward).
 
-    t_a_b_m (n, 3), m. q_a_b_xyzw (n, 4). covariance (n, 6, 6): position (m), then the small rotation w (rad) with
-    R_true = exp(w) R_a_b, both in A's camera frame. range_m (n,). lights (n,): number of different lights used. With
-    an attitude of A: t_ned_m, sigma_ned_m (n, 3), azimuth_rad (from north, clockwise), inclination_rad (up) and their
-    sigmas (n,), which count the compass's error.
+    t_a_b_m (n, 3): B's camera in A's camera frame. q_a_b_xyzw (n, 4). covariance (n, 6, 6): position (m), then the
+    small rotation w (rad) with R_true = exp(w) R_a_b, both in A's camera frame. range_m (n,). lights (n,): number of
+    different lights used. With an attitude of A: t_ned_m (n, 3), north-east-down; sigma_ned_m (n, 3), azimuth_rad
+    (from north, clockwise), inclination_rad (up) and their sigmas (n,), 1 sd, which count the compass's error; else
+    NaN.
     """
 
     t_a_b_m: Floats
@@ -108,7 +109,11 @@ class EstimateColumns(Columns):
 
 @dataclass(frozen=True, eq=False)
 class PoseColumns(EstimateColumns):
-    """The poses of triggers: trigger, chi2 (n,); method (n,): "refined", "three_lights", ..."""
+    """The poses of triggers. trigger (n,): the instant trigger * trigger_period_ns.
+
+    chi2 (n,): of the lights' places in both pictures, two degrees of freedom with four lights. method (n,): that of
+    `solve` ("refined", "exact", ...), or "three_lights" where one light was not seen.
+    """
 
     trigger: Integers
     chi2: Floats
@@ -155,7 +160,10 @@ class NodePoseColumns(Columns):
 
 @dataclass(frozen=True, eq=False)
 class RejectionColumns(Columns):
-    """Triggers without a pose: trigger, reason (one word), detail (n,)."""
+    """Triggers without a pose: trigger, reason, detail (n,).
+
+    reason: one of those that docs/troubleshooting.md explains. detail: the same in words, with figures; may be "".
+    """
 
     trigger: Integers
     reason: Texts
@@ -164,7 +172,10 @@ class RejectionColumns(Columns):
 
 @dataclass(frozen=True, eq=False)
 class AttitudeColumns(Columns):
-    """A node's orientation: q_ned_body_xyzw (n, 4), body to north-east-down; sigma_rad (n, 3): roll, pitch, yaw."""
+    """A node's orientation: q_ned_body_xyzw (n, 4), body (x forward, y right, z down) to north-east-down.
+
+    sigma_rad (n, 3): of roll, pitch, yaw, 1 sd.
+    """
 
     q_ned_body_xyzw: Floats
     sigma_rad: Floats
@@ -172,7 +183,10 @@ class AttitudeColumns(Columns):
 
 @dataclass(frozen=True, eq=False)
 class DepthColumns(Columns):
-    """A node's depth gauge: depth_m (down, 0 at the surface), sigma_m, pressure_pa, temperature_degc (n,)."""
+    """A node's depth gauge: depth_m (down, 0 at the surface), sigma_m (1 sd), pressure_pa, temperature_degc (n,).
+
+    pressure_pa: absolute, at the gauge's port. temperature_degc: of the water there.
+    """
 
     depth_m: Floats
     sigma_m: Floats
@@ -182,7 +196,11 @@ class DepthColumns(Columns):
 
 @dataclass(frozen=True, eq=False)
 class ImuColumns(Columns):
-    """A node's raw inertial samples in its body frame: accel_mps2, gyro_radps, mag_t (n, 3)."""
+    """A node's raw inertial samples in its body frame (x forward, y right, z down): (n, 3) each.
+
+    accel_mps2: specific force, (0, 0, -9.8) of a level node at rest. gyro_radps: turn rate. mag_t: uncalibrated
+    magnetic field; NaN where it was not read.
+    """
 
     accel_mps2: Floats
     gyro_radps: Floats

@@ -45,7 +45,7 @@ class HubConfig(Config, frozen=True, kw_only=True):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("--config", metavar="FILE.toml", help="the hub's configuration")
-    parser.add_argument("--listen", metavar="ENDPOINT", help=f"default: {DEFAULT_ENDPOINT}")
+    parser.add_argument("--listen", metavar="ENDPOINT", help=f"where; default: {DEFAULT_ENDPOINT}, this machine alone")
     parser.add_argument("--insecure", action="store_true", help="listen beyond this machine without TLS")
     parser.add_argument("--seconds", type=above_zero, metavar="S", help="stop after this long")
 

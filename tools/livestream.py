@@ -28,7 +28,7 @@ class LiveStream(Generic[M]):
     """Iterates over the messages of a topic as they arrive; a context manager that leaves the bus.
 
     ids: of a node or pair; None: all. Ends after `seconds`, if given. Beyond a thousand waiting messages the oldest
-    is dropped. Raises NoHubError if no hub answers within connect_s.
+    is dropped, and counted in `dropped`. Raises NoHubError, a BuddylineError, if no hub answers within connect_s.
     """
 
     def __init__(

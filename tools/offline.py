@@ -30,7 +30,10 @@ from buddyline.tools.solve import is_replaced, messages_of, solved
 
 @dataclass(frozen=True, eq=False)
 class SolvedDive:
-    """The poses, rejections and track of a dive, as columns by time. pair: a and b of T_a_b."""
+    """The poses, rejections and track of a dive, as columns by time. pair: a and b of T_a_b.
+
+    track has no rows with track="none", and where no track was found.
+    """
 
     pair: Pair
     poses: PoseColumns

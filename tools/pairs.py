@@ -21,7 +21,7 @@ Pair: TypeAlias = tuple[str, str]
 def add_pair_argument(parser: argparse.ArgumentParser, default: str) -> None:
     """Declare --pair; default: what is taken without it, in words."""
     parser.add_argument(
-        "--pair", type=parse_pair, metavar="A/B", help=f"which pair of nodes (A,B is taken too); default: {default}"
+        "--pair", type=parse_pair, metavar="A/B", help=f"which pair of nodes, such as a/b; default: {default}"
     )
 
 

@@ -40,49 +40,63 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         to.add_argument(option, dest=field, type=type(default), default=default, metavar=metavar, help=help_text)
 
     parser.add_argument("output", metavar="OUT.mcap", help="the dive log to write; must not exist")
-    choice(parser, "environment", ENVIRONMENTS)
+    choice(parser, "environment", ENVIRONMENTS, "the waters; ")
     number(parser, "--seconds", "seconds", "S")
-    number(parser, "--rate", "rate_hz", "HZ", "triggers; ")
+    number(parser, "--rate", "rate_hz", "HZ", "triggers a second; ")
     parser.add_argument("--seed", type=int, default=1, help="each seed gives another dive; default: %(default)s")
     parser.add_argument("--images", action="store_true", help="rendered pictures in place of synthetic candidates")
     choice(parser, "exposure", EXPOSURES, "of pictures; auto: locked to the lamps, as a node's camera does it; ")
     parser.add_argument("--imu", action="store_true", help="with raw inertial samples")
     poor = "poor: mounted 1 deg off, stamped late, with walking biases, shaken by fins; "
     choice(parser, "inertial", INERTIAL_GRADES, poor)
-    number(parser, "--width", "width_px", "PX")
+    number(parser, "--width", "width_px", "PX", "of the pictures; ")
     world = parser.add_argument_group("the dive")
-    choice(world, "trajectory", TRAJECTORIES)
-    number(world, "--range-min", "range_min_m", "M")
-    number(world, "--range-max", "range_max_m", "M", "0: as far as the water allows; ")
-    number(world, "--baseline", "baseline_a_m", "M")
+    choice(world, "trajectory", TRAJECTORIES, "how b swims about a; rest: both hold still; ")
+    number(world, "--range-min", "range_min_m", "M", "nearest distance between the nodes; ")
+    number(world, "--range-max", "range_max_m", "M", "farthest; 0: as far as the water allows; ")
+    number(world, "--baseline", "baseline_a_m", "M", "distance between a node's lights; ")
     world.add_argument(
-        "--nodes", type=int, default=2, metavar="N", help="a, b, c, ...: above 2 in two groups; default: %(default)s"
+        "--nodes",
+        type=int,
+        default=2,
+        metavar="N",
+        help="how many nodes: a, b, c, ...; above 2 they are in two groups; default: %(default)s",
     )
     world.add_argument(
         "--fixed", action="append", default=[], metavar="NODE", help="a node that stands still, such as a; repeatable"
     )
     world.add_argument("--blink", action="store_true", help="each node's left lamp blinks by a code of its own")
-    number(world, "--others", "other_lamps", "N", "other divers' lamps; ")
+    number(world, "--others", "other_lamps", "N", "how many lamps of other divers; ")
     world.add_argument("--tags", action="store_true", help="two AR tags on each node, for comparison")
     world.add_argument("--undisturbed", action="store_true", help="no diver looks away, nothing passes before a light")
     faults = parser.add_argument_group("noise and faults")
-    number(faults, "--sigma-px", "sigma_px", "PX", "noise of candidates; ")
-    number(faults, "--gross", "gross_share", "SHARE", "off by pixels; ")
+    number(faults, "--sigma-px", "sigma_px", "PX", "1 sd of a candidate's place; ")
+    number(faults, "--gross", "gross_share", "SHARE", "candidates that are off by several pixels; ")
     number(faults, "--misses", "miss_share", "SHARE", "lights not found; ")
-    number(faults, "--false", "false_lights", "N", "false ones a picture; ")
+    number(faults, "--false", "false_lights", "N", "false candidates in each picture; ")
     number(faults, "--lost", "lost_share", "SHARE", "frames lost; ")
     faults.add_argument("--clock-offset-ms", type=float, default=0.0, metavar="MS", help="b's clock ahead of a's")
-    faults.add_argument("--clock-drift-ppm", type=float, default=0.0, metavar="PPM", help="and gaining")
-    faults.add_argument("--magnetometer-off-deg", type=float, default=0.0, metavar="DEG", help="b's heading is wrong")
+    faults.add_argument(
+        "--clock-drift-ppm", type=float, default=0.0, metavar="PPM", help="how fast b's clock gains on a's"
+    )
+    faults.add_argument(
+        "--magnetometer-off-deg", type=float, default=0.0, metavar="DEG", help="b's heading is wrong by this"
+    )
     faults.add_argument(
         "--dead-lamp", action="append", default=[], metavar="NODE.SIDE", help="a dark lamp, such as b.left; repeatable"
     )
     faults.add_argument(
-        "--decoy", action="append", default=[], choices=DECOYS, help="in pictures, what is taken for lamps; repeatable"
+        "--decoy",
+        action="append",
+        default=[],
+        choices=DECOYS,
+        help="show in pictures what may be taken for lamps; repeatable",
     )
-    number(faults, "--pwm-hz", "pwm_hz", "HZ", "lights dimmed by pulses; ")
-    number(faults, "--strobe-s", "strobe_s", "S", "a strobe flashes so often; ")
-    faults.add_argument("--row-time-us", type=float, default=0.0, metavar="US", help="rolling shutter: time a row")
+    number(faults, "--pwm-hz", "pwm_hz", "HZ", "the lights are dimmed by pulses; 0: not dimmed; ")
+    number(faults, "--strobe-s", "strobe_s", "S", "time between a strobe's flashes; 0: no strobe; ")
+    faults.add_argument(
+        "--row-time-us", type=float, default=0.0, metavar="US", help="rolling shutter: time from row to row; 0: none"
+    )
 
 
 def run(args: argparse.Namespace) -> int:

@@ -7,6 +7,7 @@ out of them.
 
 from __future__ import annotations
 
+import argparse
 import inspect
 import os
 import posixpath
@@ -72,8 +73,22 @@ def commands() -> str:
     """Return the page of all commands, each with its own help."""
     os.environ["COLUMNS"] = "100"
     said = ["# Commands\n\nAll are parts of one program, `buddyline`. What each says of itself:\n"]
-    said += [f"## buddyline {one.name}\n\n```text\n{one.parser().format_help()}```\n" for one in COMMANDS]
+    for one in COMMANDS:
+        parser = one.parser()
+        said.append(f"## buddyline {one.name}\n\n```text\n{parser.format_help()}```\n")
+        for name, part in parts_of(parser).items():
+            said.append(f"### buddyline {one.name} {name}\n\n```text\n{part.format_help()}```\n")
     return "\n".join(said)
+
+
+def parts_of(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """Return the parsers of a command's subcommands, by name."""
+    return {
+        name: part
+        for action in parser._actions
+        if isinstance(action, argparse._SubParsersAction)
+        for name, part in action.choices.items()
+    }
 
 
 def messages() -> str:

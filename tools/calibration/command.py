@@ -47,10 +47,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         return kind
 
     board = add("write the calibration board as a PDF to print", _board, "board -o board.pdf")
-    board.add_argument("-o", "--output", required=True, metavar="BOARD.pdf")
+    board.add_argument("-o", "--output", required=True, metavar="BOARD.pdf", help="must not exist yet")
 
     camera = add(
-        "find the camera's intrinsics from pictures of the board, taken in water",
+        "find the camera's focal length, centre and distortion from pictures of the board, taken in water",
         _camera,
         "camera pictures/ --square-mm 30",
     )
@@ -58,13 +58,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "pictures", nargs="+", metavar="PICTURES", help="folders, pictures, or a dive log with pictures"
     )
     camera.add_argument("--node", help="whose pictures, of a log of several nodes")
-    camera.add_argument("--info", metavar="FILE", help="the node's description: its log, or JSON")
-    camera.add_argument("--new-info", metavar="OUT.json", help="write a description with this result, for solve --info")
+    camera.add_argument(
+        "--info", metavar="FILE", help="with --new-info: the node's NodeInfo so far, as JSON or its log"
+    )
+    camera.add_argument(
+        "--new-info", metavar="OUT.json", help="write its NodeInfo with this result, for `solve --info`"
+    )
 
     lights = add(
-        "find the positions of two nodes' lights from a solved dive at taped distances",
+        "find the places of two nodes' lights from a solved dive in which both rested at taped distances",
         _lights,
-        "lights solved.mcap --tape 10 40 3.00 --tape 60 90 6.00",
+        "lights solved.mcap --tape 10 40 2.00 --tape 60 90 3.00 --tape 110 140 4.00 --tape 160 190 5.00 "
+        "--tape 210 240 6.00",
     )
     lights.add_argument("dives", nargs="+", metavar="SOLVED.mcap", help="what `buddyline solve` wrote")
     lights.add_argument(
@@ -74,21 +79,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         required=True,
         metavar=("BEGIN_S", "END_S", "METRES"),
-        help="while both nodes rested, this far from camera to camera; once for each place",
+        help="both rested from BEGIN_S to END_S seconds after the dive's start, METRES from camera to camera; once for "
+        "each place, five at least",
     )
-    lights.add_argument("--nodes", nargs=2, metavar=("A", "B"), help="the pair, of a dive of several")
-    lights.add_argument("--pixel-sigma", type=float, default=0.5, metavar="PX", help="of a light's mean; default 0.5")
-    lights.add_argument("--tape-sigma-mm", type=float, default=5.0, metavar="MM", help="of a distance; default 5")
-    lights.add_argument("--ruler-sigma-mm", type=float, default=10.0, metavar="MM", help="of the entered positions")
+    lights.add_argument("--nodes", nargs=2, metavar=("A", "B"), help="which pair, of a dive of several")
+    lights.add_argument(
+        "--pixel-sigma", type=float, default=0.5, metavar="PX", help="1 sd of a light's mean place; default: 0.5"
+    )
+    lights.add_argument(
+        "--tape-sigma-mm", type=float, default=5.0, metavar="MM", help="1 sd of a taped distance; default: 5"
+    )
+    lights.add_argument(
+        "--ruler-sigma-mm", type=float, default=10.0, metavar="MM", help="1 sd of the configured places; default: 10"
+    )
     lights.add_argument(
         "--new-info",
         nargs=2,
         metavar=("A.json", "B.json"),
-        help="write descriptions of both nodes with this result, for solve --info",
+        help="write both nodes' NodeInfo with this result, for `solve --info`",
     )
 
     magnetometer = add(
-        "find hard and soft iron from a log of the rig turned every way",
+        "find what the rig's own iron adds to the field (hard and soft iron), from a log of it being turned every way",
         _magnetometer,
         "magnetometer a.mcap --position 59.9 10.8",
     )

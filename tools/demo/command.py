@@ -37,11 +37,15 @@ LOOK_S: Final = 0.1
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("--seconds", type=above_zero, metavar="S", help="end after this long; default: at Ctrl-C")
-    parser.add_argument("--environment", default="cavern", choices=ENVIRONMENTS, help="default: cavern")
+    parser.add_argument("--environment", default="cavern", choices=ENVIRONMENTS, help="the waters; default: cavern")
     parser.add_argument("--seed", type=int, default=1, help="each seed gives another dive; default: 1")
     parser.add_argument("--rate", type=above_zero, default=10.0, metavar="HZ", help="triggers a second; default: 10")
     parser.add_argument(
-        "--nodes", type=int, default=2, metavar="N", help="a, b, c, ...; each renders its pictures; default: 2"
+        "--nodes",
+        type=int,
+        default=2,
+        metavar="N",
+        help="how many nodes: a, b, c, ...; each renders its pictures; default: 2",
     )
     parser.add_argument(
         "--fixed", action="append", default=[], metavar="NODE", help="a node that stands still, such as a; repeatable"
@@ -53,7 +57,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="keep the nodes' dive logs here, the truth, and the solved dive with its report; default: nothing is kept",
     )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
-    parser.add_argument("--monitor", action="store_true", help="watch it on the monitor's page, in the browser")
+    parser.add_argument(
+        "--monitor",
+        action="store_true",
+        help="watch it on the monitor's page in the browser; needs the extra `monitor`",
+    )
 
 
 _NODE_TOML: Final = """\

@@ -125,7 +125,7 @@ class _Drawing:
         """Return a camera's entity: in its net; without one A's in the world, the others in A's."""
         if node in self._nets:
             return f"world/net_{self._nets[node]}/{node}"
-        return f"world/{node}" if node == self._base else f"world/{self._base}/{node}"
+        return f"world/{node}" if node == self._base else f"{self._eye(self._base)}/{node}"
 
     def take_placed(self, pose: NodePose) -> None:
         """Draw a node in its net, and how deep the net is."""

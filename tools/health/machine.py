@@ -67,7 +67,7 @@ def clock(tracking: Tracking | None, error: str, timesyncd: bool, *, stamps: boo
 def clock_chip(*, kept: bool, stamps: bool) -> Finding:
     """Judge whether the time outlives a night without power. kept: a chip has given it; stamps: as for `clock`."""
     if not stamps:
-        return Finding("clock chip", "skipped", "this machine stamps no pictures")
+        return Finding("clock chip", "skipped", "only a node needs one")
     if kept:
         return Finding("clock chip", "ok", "the time of the start is a clock chip's")
     return Finding(

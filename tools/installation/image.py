@@ -32,11 +32,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     pi.add_arguments(parser)
     parser.add_argument("--source", required=True, metavar="URL", help="your copy of this repository, for git clone")
     parser.add_argument("--ssh-key", required=True, metavar="FILE.pub", help="the public key with which you log in")
-    parser.add_argument("--address", metavar="IP/BITS", help="on the tether; default: 192.168.2.2/24 for a, .3 for b")
-    parser.add_argument("--gateway", metavar="IP", help="on the tether: a machine that shares its Internet connection")
+    parser.add_argument(
+        "--address", metavar="IP/BITS", help="the node's, on the tether; default: 192.168.2.2/24 for a, .3 for b"
+    )
+    parser.add_argument("--gateway", metavar="IP", help="a machine on the tether that shares its Internet connection")
     parser.add_argument("--wifi", metavar="NAME", help="a wireless network, for the first start's downloads")
     parser.add_argument("--wifi-password", metavar="FILE", help="a file that holds its password")
-    parser.add_argument("--country", default="NO", metavar="CC", help="of the wireless network; default: %(default)s")
+    parser.add_argument(
+        "--country",
+        default="NO",
+        metavar="CC",
+        help="whose radio rules apply to the wireless network; default: %(default)s",
+    )
     parser.add_argument("--user", default="diver", help="who runs the node; default: %(default)s")
 
 

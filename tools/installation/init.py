@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("service", choices=("node", "hub", "solver"), help="whose configuration to write")
     parser.add_argument("-o", "--output", metavar="FILE.toml", help="default: NODE.toml, hub.toml, solver.toml")
     parser.add_argument("--node", default="a", metavar="ID", help="a node's id: 1 to 32 of a-z, 0-9, _; default: a")
-    parser.add_argument("--connect", metavar="ENDPOINT", help="where the hub listens, such as tls/192.168.2.1:7447")
+    parser.add_argument("--connect", metavar="ENDPOINT", help="where the hub is, such as tls/192.168.2.1:7447")
     parser.add_argument("--simulated", action="store_true", help="a node with a simulated camera and sensors")
 
 

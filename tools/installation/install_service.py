@@ -63,7 +63,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("service", choices=tuple(AFTER), help="which unit to write: buddyline-<service>.service")
     parser.add_argument("--config", metavar="FILE.toml", help="its configuration; a node must have one")
     parser.add_argument(
-        "--run-as", metavar="USER", help="who runs the service; default: who called sudo. The unit adds the groups"
+        "--run-as",
+        metavar="USER",
+        help="who runs the service; default: who called sudo. The unit adds the groups that it needs",
     )
     parser.add_argument("--print", action="store_true", help="show the unit, write nothing")
     parser.add_argument("--user", action="store_true", help="write a unit of your own (systemctl --user), not hardened")

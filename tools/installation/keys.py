@@ -54,9 +54,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         dest="whose", required=True, metavar="|".join(("init", "node", *ROLES, "list", "renew"))
     )
     first = subcommand(whose, "init", "make the authority and the hub's certificate", "keys init --hub 192.168.2.1")
-    first.add_argument("--hub", default="127.0.0.1", metavar="HOST", help="where clients find it; default: %(default)s")
+    first.add_argument(
+        "--hub",
+        default="127.0.0.1",
+        metavar="HOST",
+        help="the hub's address, as clients reach it; default: %(default)s",
+    )
     node = subcommand(
-        whose, "node", "make a node's certificate; the hub then lets it publish its own keys", "keys node a"
+        whose, "node", "make a node's certificate, and let it publish as this node and as no other", "keys node a"
     )
     node.add_argument("node", metavar="ID", help="the node's id, as in its configuration")
     for name, role in ROLES.items():

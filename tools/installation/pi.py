@@ -57,8 +57,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.toml",
         help="the node's configuration; `image` needs the files of its [tls] beside it",
     )
-    parser.add_argument("--clock-from", metavar="IP", help="the node whose clock this one follows; default: a's")
-    parser.add_argument("--clock-chip", choices=tuple(CLOCK_CHIPS), default="none", help="default: %(default)s")
+    parser.add_argument(
+        "--clock-from", metavar="IP", help="the node whose clock this one follows; default: 192.168.2.2, a's"
+    )
+    parser.add_argument(
+        "--clock-chip", choices=tuple(CLOCK_CHIPS), default="none", help="a clock with a battery; default: %(default)s"
+    )
 
 
 def load(path: str) -> NodeConfig:

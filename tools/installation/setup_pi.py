@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--address",
         metavar="IP/BITS",
-        help="on the tether; default: 192.168.2.2/24 for a, .3 for b; keep: leave the network as it is",
+        help="the node's, on the tether; default: 192.168.2.2/24 for a, .3 for b; keep: leave the network as it is",
     )
     parser.add_argument("--run-as", metavar="USER", help="who runs the node; default: who called sudo")
     parser.add_argument("--apply", action="store_true", help="do it; needs root. Default: only say what is to do")

@@ -41,6 +41,12 @@ FORMATS: Final = {
     "pdf": ".pdf",
 }
 
+SAYS: Final = (
+    "svx, svx-cartesian: Survex, by measurements or by coordinates; th: Therion; dat: Compass; csv: the legs; "
+    "stations, residuals: tables; geojson, kml, gpkg, dxf: maps; control, scalebars: tables for photogrammetry; "
+    "svg, profile: plan and side view; pdf: both to print; default: svx"
+)
+
 # Formats that can be written in more than one way.
 STYLES: Final = {"svx": ("auto", "diving", "normal"), "th": ("auto", "diving")}
 
@@ -53,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         one = subcommand(does, example.split(maxsplit=1)[0], text, f"survey {example}")
         one.set_defaults(survey=runs)
         if runs not in (_watch, _tags):
-            one.add_argument("project", metavar="PROJECT.toml", type=Path)
+            one.add_argument("project", metavar="PROJECT.toml", type=Path, help="the survey; `legs --dive` begins one")
         if runs not in (_watch, _tags, _legs, _import):
             one.add_argument(
                 "--depth",
@@ -70,7 +76,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     legs.add_argument("--dive", nargs="+", metavar="LOG.mcap", help="new project: the solved log, and each node's own")
     legs.add_argument(
-        "--marks", type=Path, metavar="TIMES.csv", help="columns: time, node, name, and optionally kind and note"
+        "--marks",
+        type=Path,
+        metavar="TIMES.csv",
+        help="which node was where when; columns: time, node, name, and optionally kind and note",
     )
     imported = add(
         "take in surveys of other programs: they are adjusted with the project's own legs",
@@ -85,13 +94,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="Survex .svx, Therion .th, Compass .dat or .mak, Walls .srv, a table .csv, PocketTopo .txt, "
         "Mnemo and JedEye .dmp, Ariane .tml",
     )
-    imported.add_argument("--name", metavar="NAME", help="before its stations' names; default: the file's")
+    imported.add_argument(
+        "--name", metavar="NAME", help="put this before its stations' names; default: the file's name"
+    )
     adjust = add("adjust the network and print loops, residuals and probable blunders", _adjust, "adjust cave.toml")
     adjust.add_argument("--json", action="store_true", help="print everything as one JSON object")
     report = add("write an HTML report", _report, "report cave.toml -o cave.html")
     report.add_argument("-o", "--output", metavar="REPORT.html", help="default: beside the project")
     export = add("write the survey for other programs", _export, "export cave.toml --format svx")
-    export.add_argument("--format", choices=FORMATS, default="svx", help="default: svx (Survex)")
+    export.add_argument("--format", choices=FORMATS, default="svx", help=SAYS)
     export.add_argument(
         "--style",
         choices=("auto", "diving", "normal"),
@@ -101,13 +112,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "and as adjusted in th, because Therion weighs loops without correlations",
     )
     export.add_argument("-o", "--output", metavar="FILE", help="default: beside the project; - for stdout")
-    watch = add("say on the bus, while the divers rest, whether their leg is good", _watch, "watch")
+    watch = add("tell monitor and nodes, while the divers rest, whether their leg is good", _watch, "watch")
     add_client_arguments(watch, SURVEYOR)
     watch.add_argument("--seconds", type=above_zero, metavar="S", help="stop after this long; default: at Ctrl-C")
     tags = add("write pages of station tags to print", _tags, "tags 100 139 -o tags.pdf")
     tags.add_argument("first", type=int, help="number of the first tag, from 100 on")
     tags.add_argument("last", type=int, help="number of the last one, up to 586")
-    tags.add_argument("--side-mm", type=above_zero, default=60.0, metavar="MM", help="of the black square; default: 60")
+    tags.add_argument(
+        "--side-mm", type=above_zero, default=60.0, metavar="MM", help="side of the black square; default: 60"
+    )
     tags.add_argument("-o", "--output", required=True, metavar="TAGS.pdf", help="- for stdout")
 
 

@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seconds", type=above_zero, metavar="S", help="give up after this long without a hub; default: wait for it"
     )
     parser.add_argument(
-        "--linger", type=float, default=1.0, metavar="S", help="stay on the bus for this long; default: 1"
+        "--linger", type=float, default=1.0, metavar="S", help="stay connected for this long after the mark; default: 1"
     )
 
 
