@@ -108,6 +108,8 @@ def test_each_command_exists_and_is_what_the_readme_says(desk):
     makefile = (REPOSITORY / "Makefile").read_text()
     assert re.search(rf"^{make[make.index('-C') + 2]}:", makefile, re.MULTILINE)
     assert "EXTRAS" in makefile
+    # Without `keys` a node with a certificate does not sign its log.
+    assert make[-1] == "EXTRAS=keys,pi"
     assert ["systemctl", "start", "buddyline-node"] in user["runcmd"]
 
 

@@ -63,7 +63,7 @@ def machine(tmp_path, monkeypatch):
     (tmp_path / "copy" / "Makefile").touch()
     monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
     monkeypatch.setattr(setup_pi.sys, "prefix", str(tmp_path / "copy" / ".venv"))
-    monkeypatch.setattr(setup_pi, "MODULES", ("json", "nowhere_to_be_found"))
+    monkeypatch.setattr(setup_pi, "MODULES", {"pi": ("json",), "keys": ("nowhere_to_be_found",)})
     return machine
 
 
@@ -90,7 +90,9 @@ def test_each_step_is_done_once(machine, monkeypatch):
     (install,) = (call for call in said if call.startswith("apt-get install"))
     assert "chrony" in install
     assert " git " not in install
-    assert f"make -C {machine.folder}/copy install EXTRAS=pi" in [call.partition(" CONSTRAINTS")[0] for call in said]
+    assert f"make -C {machine.folder}/copy install EXTRAS=keys,pi" in [
+        call.partition(" CONSTRAINTS")[0] for call in said
+    ]
     assert machine.boot.read_text().startswith("dtparam=audio=on\n")
     assert "dtoverlay=i2c-rtc,ds3231\n" in machine.boot.read_text()
     assert machine.boot.with_name("config.txt.before").read_text() == "dtparam=audio=on\n"
@@ -100,7 +102,7 @@ def test_each_step_is_done_once(machine, monkeypatch):
     unit = (machine.root / "etc" / "systemd" / "system" / setup_pi.UNIT).read_text()
     assert f"--config {machine.config}" in unit
     assert "SupplementaryGroups=video i2c gpio" in unit
-    monkeypatch.setattr(setup_pi, "MODULES", ("json",))
+    monkeypatch.setattr(setup_pi, "MODULES", {"pi": ("json",), "keys": ("json",)})
     again = list(machine.steps(clock_chip="ds3231"))
     assert [step.name for step in again if not step.done] == []
     # Another clock chip is one step more, not all of them. What a person has written since is shown, and kept.
@@ -151,7 +153,7 @@ def test_run_says_what_is_to_do_then_does_it_then_calls_doctor(machine, capsys, 
     assert setup_pi.run(args) == 0
     assert "restart the Pi" in capsys.readouterr().out
     assert not (machine.root / setup_pi.TETHER_FILE[1:]).exists()
-    monkeypatch.setattr(setup_pi, "MODULES", ("json",))
+    monkeypatch.setattr(setup_pi, "MODULES", {"pi": ("json",), "keys": ("json",)})
     doctor = machine.folder / "bin" / "doctor"
     doctor.write_text(f'#!/bin/sh\necho "$*" > {machine.folder}/doctor_said\nexit 1\n')
     doctor.chmod(0o755)

@@ -84,7 +84,7 @@ def user_data(args: argparse.Namespace, config: NodeConfig) -> dict[str, Any]:
     setup += ["--clock-from", str(pi.ip("--clock-from", args.clock_from))] if args.clock_from else []
     commands = [
         [*mine, "git", "clone", args.source, folder],
-        [*mine, "make", "-C", folder, "install", "EXTRAS=pi"],
+        [*mine, "make", "-C", folder, "install", f"EXTRAS={pi.extras(config)}"],
         [f"{folder}/.venv/bin/buddyline", "setup", "pi", *setup, "--apply"],
         # What a restart would do for the files that it has written.
         ["modprobe", "i2c-dev"],

@@ -75,6 +75,11 @@ def load(path: str) -> NodeConfig:
     return config
 
 
+def extras(config: NodeConfig) -> str:
+    """Return the extras that a node's program needs: a node with a certificate signs its log by the extra `keys`."""
+    return "pi" if config.tls is None else "keys,pi"
+
+
 def config_lines(config: NodeConfig, clock_chip: str) -> list[str]:
     """Return the lines of config.txt: buses, camera, watchdog, clock chip, and a lamp that is on from power-on."""
     lines = ["dtparam=i2c_arm=on", "dtparam=watchdog=on", "camera_auto_detect=1", *CLOCK_CHIPS[clock_chip]]

@@ -25,8 +25,8 @@ from buddyline.tools.installation import install_service, pi
 if TYPE_CHECKING:
     from buddyline.node.config import NodeConfig
 
-# What the extra `pi` gives, and, of the system's packages, the camera.
-MODULES: Final = ("picamera2", "gpiozero", "smbus2", "vqf", "pygeomag")
+# What each extra gives, and, of the system's packages, the camera.
+MODULES: Final = {"pi": ("picamera2", "gpiozero", "smbus2", "vqf", "pygeomag"), "keys": ("cryptography",)}
 UNIT: Final = "buddyline-node.service"
 TETHER_FILE: Final = "/etc/NetworkManager/system-connections/buddyline.nmconnection"
 
@@ -88,7 +88,7 @@ def steps(args: argparse.Namespace, user: str, root: Path) -> Iterator[SetupStep
     if not boot.exists():
         raise BuddylineError(f"{boot}: not there: `setup pi` is for Raspberry Pi OS, from Bookworm on")
     yield _packages()
-    yield _environment(user)
+    yield _environment(user, pi.extras(config))
     yield _file("devices", boot, pi.with_block(pi.read_text(boot), pi.config_lines(config, args.clock_chip)))
     for name, text in pi.system_files(config, user, args.clock_from).items():
         yield _file("file", root / name[1:], text)
@@ -113,18 +113,19 @@ def _packages() -> SetupStep:
     return SetupStep("packages", f"apt-get install {' '.join(missing or pi.PACKAGES)}", not missing, do)
 
 
-def _environment(user: str) -> SetupStep:
-    """Have the extra `pi` and the system's camera in this environment."""
-    done = all(importlib.util.find_spec(name) is not None for name in MODULES)
+def _environment(user: str, extras: str) -> SetupStep:
+    """Have these extras and the system's camera in this environment."""
+    wanted = [name for extra in extras.split(",") for name in MODULES[extra]]
+    done = all(importlib.util.find_spec(name) is not None for name in wanted)
     copy = Path(sys.prefix).parent
-    words = ["make", "-C", str(copy), "install", "EXTRAS=pi"]
+    words = ["make", "-C", str(copy), "install", f"EXTRAS={extras}"]
     if _codename() == "bookworm":
         words.append("CONSTRAINTS=node/examples/bookworm.txt")
 
     def do() -> None:
         if not (copy / "Makefile").exists():
             raise BuddylineError(
-                f"{sys.prefix}: is not the .venv of a copy of the repository: install the extra `pi` there by hand"
+                f"{sys.prefix}: is not the .venv of a copy of the repository: install the extras {extras} there by hand"
             )
         _call(words, user=user)
 
