@@ -66,7 +66,6 @@ KEYS = ("keys init --hub 127.0.0.1", "keys node a", "keys node b", "keys solver"
 TLS_NODE = "init node --simulated --connect tls/127.0.0.1:7447 --node"
 # What a document takes for done before its first command.
 DONE = {
-    "docs/tutorial.md": KEYS,
     "docs/pool_day.md": (*KEYS, f"{TLS_NODE} a -o keys/a.toml", f"{TLS_NODE} b -o keys/b.toml"),
 }
 # And what runs beside it: nodes that wait for their hub.
