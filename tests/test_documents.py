@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from buddyline import read_info
 from buddyline.tools.cli import COMMANDS
 
 from tests.processes import REPOSITORY
@@ -113,6 +114,15 @@ def test_the_site_has_every_document() -> None:
     pages = set(re.findall(r'"([\w/]+\.md)"', (REPOSITORY / "docs" / "site" / "make.py").read_text()))
     there = {str(path.relative_to(REPOSITORY)) for path in DOCUMENTS if path.parent.name != "golden"}
     assert there <= pages
+
+
+def test_the_file_of_a_tripod_in_the_documents_is_read(tmp_path: Path) -> None:
+    text = re.search(r"```json\n(.*?)```", (REPOSITORY / "docs" / "network.md").read_text(), re.DOTALL)
+    assert text is not None
+    (tmp_path / "c.json").write_text(text[1])
+    info = read_info(tmp_path / "c.json")
+    assert info.fixed
+    assert not info.has_camera
 
 
 @pytest.mark.parametrize(
