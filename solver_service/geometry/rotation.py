@@ -43,6 +43,12 @@ def skew(v: Floats) -> Floats:
     return (v @ _CROSS).reshape(*v.shape, 3)
 
 
+def applied(M: Floats, v: Floats) -> Floats:
+    """Give the products (..., m) of matrices (..., m, n) with vectors (..., n)."""
+    product: Floats = (M @ v[..., None])[..., 0]
+    return product
+
+
 def quat_to_matrix(q_xyzw: Floats) -> Floats:
     """Turn quaternions (..., 4), of any length but zero, into matrices (..., 3, 3)."""
     products = q_xyzw[..., :, None] * q_xyzw[..., None, :]
@@ -117,14 +123,24 @@ def _one_exp(x: float, y: float, z: float) -> tuple[float, ...]:
 
 
 def left_jacobian(w_rad: Floats) -> Floats:
-    """Give J (3, 3) of a rotation vector (3,): exp(w + dw) = exp(J dw) exp(w), and J t is the way of a screw (w, t)."""
-    angle2 = float(w_rad @ w_rad)
-    half = max(0.5 * math.sqrt(angle2), _TINY)
-    sine = math.sin(half) / half
-    # (x - sin x) / x^3 loses its digits near 0.
-    second = 1.0 / 6.0 - angle2 / 120.0 if angle2 < 1e-4 else (1.0 - sine * math.cos(half)) / angle2
+    """Give J (..., 3, 3) of rotation vectors (..., 3).
+
+    exp(w + dw) = exp(J dw) exp(w), and J t is the way of a screw (w, t).
+    """
     K = skew(w_rad)
-    J: Floats = _IDENTITY + (0.5 * sine * sine) * K + second * (K @ K)
+    if w_rad.ndim == 1:
+        angle2 = float(w_rad @ w_rad)
+        half = max(0.5 * math.sqrt(angle2), _TINY)
+        sine = math.sin(half) / half
+        # (x - sin x) / x^3 loses its digits near 0.
+        second = 1.0 / 6.0 - angle2 / 120.0 if angle2 < 1e-4 else (1.0 - sine * math.cos(half)) / angle2
+        of_one: Floats = _IDENTITY + (0.5 * sine * sine) * K + second * (K @ K)
+        return of_one
+    angles2 = inner(w_rad, w_rad)[..., None, None]
+    halves = np.maximum(0.5 * np.sqrt(angles2), _TINY)
+    sines, small = np.sin(halves) / halves, angles2 < 1e-4
+    seconds = (1.0 - sines * np.cos(halves)) / np.where(small, 1.0, angles2)
+    J: Floats = _IDENTITY + (0.5 * sines * sines) * K + np.where(small, 1.0 / 6.0 - angles2 / 120.0, seconds) * (K @ K)
     return J
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, skew
 from buddyline.solver_service.track.samples import Samples
 from buddyline.solver_service.track.strapdown import OWN, Carried, Increments, SampleGrid, integrate
+from numpy.typing import NDArray
 
 # Constants may change by so much before steps are integrated anew: the gyro's bias, the accelerometer's, mount, lever
 # arm, delay. What is neglected is the square of that, and how shaking changes the force within the delay's change.
@@ -83,17 +84,26 @@ class StepsAhead:
         )
 
 
-def steps_ahead(
-    of_nodes: Sequence[Samples], state: Carried, times_s: Sequence[float], hold_s: float, *, by_shares: bool
-) -> StepsAhead:
-    """Integrate both nodes' samples between times (M + 1,), but for steps that samples do not tell throughout.
+@dataclass(frozen=True, eq=False)
+class ToldSteps:
+    """The samples of those steps (M) of both nodes that samples tell throughout.
 
-    hold_s: samples so long after a step's end count for it. by_shares: whether to tell what shares of the samples'
-    fast parts do.
+    told (M,): which they are. values (M, 2, P, 13): as in SampleSteps. grid: the same of nodes (2 M), with fast parts.
     """
-    edges_s, delays_s = np.array(times_s), state.delay_s.tolist()
+
+    told: NDArray[np.intp]
+    values: Floats
+    grid: SampleGrid
+
+
+def told_steps(of_nodes: Sequence[Samples], delays_s: Floats, times_s: Floats, hold_s: float) -> ToldSteps:
+    """Give the samples between times (M + 1,), which each unit's stamps exceed by its delay.
+
+    hold_s: samples so long after a step's end count for it.
+    """
     seen = [
-        samples.steps(edges_s + delay_s, hold_s - delay_s) for samples, delay_s in zip(of_nodes, delays_s, strict=True)
+        samples.steps(times_s + delay_s, hold_s - delay_s)
+        for samples, delay_s in zip(of_nodes, delays_s.tolist(), strict=True)
     ]
     told = np.flatnonzero(np.logical_and.reduce([of_node.told for of_node in seen]))
     most, count = max(of_node.times_s.shape[1] for of_node in seen), len(of_nodes) * len(told)
@@ -104,14 +114,29 @@ def steps_ahead(
         grid_s[:, node], values[:, node] = of_node.times_s[told][:, at], of_node.values[told][:, at]
         slow_radps.append(of_node.slow_radps[told])
     each = values.reshape(count, most, 13)
-    rates_radps = each[:, :, 3:6]
     grid = SampleGrid(
         times_s=grid_s.reshape(count, most),
         values=each[..., :6],
         told=np.ones((count, most - 1), dtype=bool),
         slow_radps=np.stack(slow_radps, axis=1).reshape(count, 2, 3),
-        fast=each[..., 6:12] if by_shares else None,
+        fast=each[..., 6:12],
     )
+    return ToldSteps(told, values, grid)
+
+
+def steps_ahead(
+    of_nodes: Sequence[Samples], state: Carried, times_s: Sequence[float], hold_s: float, *, by_shares: bool
+) -> StepsAhead:
+    """Integrate both nodes' samples between times (M + 1,), but for steps that samples do not tell throughout.
+
+    hold_s: samples so long after a step's end count for it. by_shares: whether to tell what shares of the samples'
+    fast parts do.
+    """
+    steps = told_steps(of_nodes, state.delay_s, np.array(times_s), hold_s)
+    told, values, grid = steps.told, steps.values, steps.grid if by_shares else replace(steps.grid, fast=None)
+    count, most = grid.times_s.shape
+    each = values.reshape(count, most, 13)
+    rates_radps = each[:, :, 3:6]
     constants = _constants(state)
     gyro, accel, mount, lever, delay = np.split(np.tile(constants, (len(told), 1)), (3, 6, 9, 12), axis=1)
     start = _AtStart(np.broadcast_to(_IDENTITY, (count, 3, 3)), gyro, accel, mount, lever, delay[:, 0])

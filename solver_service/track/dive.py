@@ -1,4 +1,4 @@
-"""A whole dive's track: filter, smooth, decide again what was open, smooth again."""
+"""A whole dive's track: filter, smooth, pass over it again about its own path, smooth again."""
 
 from __future__ import annotations
 
@@ -11,16 +11,15 @@ from typing import Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
-from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.earlier import EARLIER_S, EarlierFilter
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import FixSeen
-from buddyline.solver_service.track.moving import KNOWN_CLOCK_S
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.parts import (
     MOST_LEFT_S,
     NEAR_CLOCK_S,
+    TOLD_SIGMAS,
     clock_left_ns,
     clock_off_by,
     goes_on,
@@ -39,17 +38,15 @@ from buddyline.solver_service.track.records import (
     pass_over,
     stamp_of,
 )
-from buddyline.solver_service.track.relax import settled
+from buddyline.solver_service.track.relax import Known, PathPass, settled
 from buddyline.solver_service.track.smoother import Path, rows_between, smoothed
-from buddyline.solver_service.track.start import CLOCK_S, broad_start
-from buddyline.solver_service.track.state import CLOCK, NAV
+from buddyline.solver_service.track.start import CLOCK_S
+from buddyline.solver_service.track.state import NAV
 from buddyline.solver_service.track.trail import Trail
 from buddyline.solver_service.track.vibration import Shares
-from buddyline.solver_service.track.walking import joint
+from buddyline.solver_service.track.walking import Walking, joint
 
-# The clocks' offset in the last pass, 1 sd: what the first pass has left beside its own sigma; and where a node has no
-# inertial unit, so that no pass estimates it.
-CLOCK_LEFT_S: Final = 0.003
+# The clocks' offset, 1 sd, where a node has no inertial unit, so that no pass estimates it.
 CLOCK_WITHOUT_S: Final = 0.003
 # A pass that finds the clocks' offset off (`clock_left_ns`) is repeated with it, CLOCK_ROUNDS passes at most.
 CLOCK_ROUNDS: Final = 4
@@ -108,82 +105,71 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
         only = _empty_filter(records, told_ns, CLOCK_WITHOUT_S)
         pass_over(only, records, fixes)
         return replace(_smoothed(only, parts_of(only), outputs_ns), clock_sigma_s=math.inf)
-    # B's stamps are moved by the offset that the first pass found: for what is left the second is linear.
-    learned = parts[-1]
-    shift_s = learned.state.clock_s if learned.covariance[CLOCK, CLOCK] < KNOWN_CLOCK_S**2 else 0.0
-    clock_sigma_s = CLOCK_LEFT_S + 3.0 * math.sqrt(learned.covariance[CLOCK, CLOCK])
     shares = reduce(Shares.plus, [part.shares for part in parts]).best()
+    known = Known(records, first.epoch_ns or 0, clock_ns, shares, Walking())
     if all(part.lone for part in parts):
-        return _of_one_lamp_each(records, clock_ns, max(parts, key=lasted_s), shares, outputs_ns)
-    # Beside a track of any other start these are not linear enough for the pass below.
+        return _of_one_lamp_each(known, max(parts, key=lasted_s), outputs_ns)
+    # Beside a track of any other start these are not linear enough for the passes below.
     parts = [part for part in parts if not part.lone]
-    walking = joint([part.walking for part in parts])
     told = sum(part.told for part in parts)
-    unrest = min(max(math.sqrt(sum(part.surprise for part in parts) / told), 0.3), 2.0) if told > 100 else None
-    paths = [(smoothed(part.steps), part.end_s, part.shaking.less(shares)) for part in parts]
-    if len(parts) == 1 and parts[0].searched and not parts[0].agreed:
-        [(path, _, shaking)] = paths
-        earlier = _path_before(records, clock_ns, path, -math.inf, shares)
-        # So far from the start, a path that is carried back is too far off for the one pass below to be linear.
-        if earlier is not None and path.t_s[0] - earlier.t_s[0] > LATE_S:
-            parts[0].steps = Trail()
-            about = (path.after(earlier), parts[0].detection, sum(parts[0].told_by))
-            found = settled(*about, records, clock_ns, shaking, shares)
-            if found is not None:
-                return _rows_of(found[0], [found[1]], outputs_ns)
-    # Every step of the first pass holds a covariance: both passes at once take twice the memory.
-    del first, parts, learned
-    # Where the dive's beginning, before the first start, leads the second pass astray, it is left out.
-    for to_beginning in (True, False):
-        second = _empty_filter(records, clock_ns + round(shift_s * 1e9), clock_sigma_s)
-        second.restarts = False
-        second.take_off(shares)
-        if unrest is not None:
-            second.unrest = unrest
-        since_s = -math.inf
-        for path, end_s, shaking in paths:
-            second.guide_by(path)
-            earlier = _path_before(records, clock_ns, path, since_s, shares) if to_beginning else None
-            if earlier is not None:
-                second.guide_by(earlier)
-            whole = earlier or path
-            state = replace(whole.state(0), clock_s=0.0)
-            begun = broad_start(second.nodes, state, clock_sigma_s, whole.oldest, shaking)
-            second.begin(float(whole.t_s[0]) - 0.01, end_s, *begun, shaking, walking)
-            since_s = end_s
-        pass_over(second, records, ())
-        parts = parts_of(second)
-        # Led astray by what was carried back, it finds other clocks than the first pass.
-        if not any(clock_off_by(part, NEAR_CLOCK_S if to_beginning else MOST_LEFT_S) for part in parts):
-            return _smoothed(second, parts, outputs_ns)
-    said = f"{second.both}: the second pass contradicts the first on the clocks, so it has diverged: no track"
-    return Smoothed([], clock_ns * 1e-9, math.inf, [*second.problems, said])
+    unrest = min(max(math.sqrt(sum(part.surprise for part in parts) / told), 0.3), 2.0) if told > 100 else 1.0
+    learned = replace(known, walking=joint([part.walking for part in parts]), unrest=unrest)
+    found: list[tuple[PathPass, Path]] = []
+    lost: list[str] = []
+    since_s = -math.inf
+    for part in parts:
+        path, shaking = smoothed(part.steps), part.shaking.less(shares)
+        # Every step of the first pass holds a covariance: both passes at once take twice the memory.
+        part.steps = Trail()
+        earlier = _path_before(known, path, since_s)
+        since_s = part.end_s
+        # Where the dive's beginning, before the first start, leads the passes astray, it is left out.
+        tries = [path] if earlier is None else [path.after(earlier), path]
+        late = len(parts) == 1 and part.searched and not part.agreed and path.t_s[0] - tries[0].t_s[0] > LATE_S
+        for about in tries:
+            told_by, by_first = sum(part.told_by), known if late else learned
+            one = settled(about, part.detection, shaking, by_first, told_by, doubtful=late)
+            if one is not None and not _contradicts(one[1], part, NEAR_CLOCK_S if about is not path else MOST_LEFT_S):
+                found.append(one)
+                break
+        else:
+            span = f"no track for {lasted_s(part):.0f} s"
+            lost.append(f"{first.both}: passes over the dive contradict the first one or do not settle: {span}")
+    if not found:
+        return Smoothed([], clock_ns * 1e-9, math.inf, [*first.problems, *lost])
+    whole = _rows_of([track for track, _ in found], [path for _, path in found], outputs_ns)
+    return replace(whole, problems=[*whole.problems, *lost])
 
 
-def _of_one_lamp_each(
-    records: Records, clock_ns: int, part: Estimate, shares: Floats, outputs_ns: Sequence[int]
-) -> Smoothed:
+def _contradicts(path: Path, first: Estimate, limit_s: float) -> bool:
+    """Whether a track's clocks are off what the first pass found by limit_s and TOLD_SIGMAS."""
+    sigma_s = math.sqrt(path.covariance(-1)[NAV, NAV])
+    return abs(path.state(-1).clock_s - first.state.clock_s) >= max(limit_s, TOLD_SIGMAS * sigma_s)
+
+
+def _of_one_lamp_each(known: Known, part: Estimate, outputs_ns: Sequence[int]) -> Smoothed:
     """Give the track that began with one lamp of each node, the dive's beginning with it if that settles, too."""
-    path, told, about = smoothed(part.steps), sum(part.told_by), (records, clock_ns, part.shaking.less(shares), shares)
+    path, told, shaking = smoothed(part.steps), sum(part.told_by), part.shaking.less(known.shares)
     part.steps = Trail()
-    found = settled(path, part.detection, told, *about)
+    found = settled(path, part.detection, shaking, known, told, doubtful=True)
     if found is None:
-        said = f"nodes {records[0].node.name} and {records[1].node.name}: one lamp of each does not tell a track"
-        return Smoothed([], clock_ns * 1e-9, math.inf, [said])
+        names = " and ".join(record.node.name for record in known.records)
+        said = f"nodes {names}: one lamp of each does not tell a track"
+        return Smoothed([], known.clock_ns * 1e-9, math.inf, [said])
     track, path = found
-    earlier = _path_before(records, clock_ns, path, -math.inf, shares)
+    earlier = _path_before(known, path, -math.inf)
     if earlier is not None:
-        track, path = settled(path.after(earlier), track.passed.detection, told, *about) or found
-    return _rows_of(track, [path], outputs_ns)
+        track, path = settled(path.after(earlier), track.passed.detection, shaking, known, told, doubtful=True) or found
+    return _rows_of([track], [path], outputs_ns)
 
 
-def _path_before(records: Records, clock_ns: int, path: Path, since_s: float, shares: Floats) -> Path | None:
+def _path_before(known: Known, path: Path, since_s: float) -> Path | None:
     """Give the path before another's start, from since_s or the dive's first picture on; None where there is none."""
+    records, clock_ns = known.records, known.clock_ns
     track = EarlierFilter(records[0].node, records[1].node, keep_s=math.inf, clock_sigma_s=CLOCK_S)
-    track.clock_ns = clock_ns
-    track.take_off(shares)
+    track.epoch_ns, track.clock_ns = known.epoch_ns, clock_ns
+    track.take_off(known.shares)
     first_ns = min(frame.stamp_ns for record in records for frame in record.frames[:1])
-    track.seconds(0, first_ns)
     start_s = float(path.t_s[0])
     begin_s = max(since_s, track.seconds(0, first_ns) + 0.1, start_s - EARLIER_S)
     if start_s - begin_s < LEAST_EARLIER_S:
@@ -239,16 +225,17 @@ def _smoothed(track: TrackFilter, parts: Sequence[Estimate], outputs_ns: Sequenc
     for part in parts:
         paths.append(smoothed(part.steps))
         part.steps = Trail()
-    return _rows_of(track, paths, outputs_ns)
+    return _rows_of([track], paths, outputs_ns)
 
 
-def _rows_of(track: TrackFilter, paths: Sequence[Path], outputs_ns: Sequence[int]) -> Smoothed:
-    """Give the rows of a last pass's paths."""
+def _rows_of(tracks: Sequence[TrackFilter | PathPass], paths: Sequence[Path], outputs_ns: Sequence[int]) -> Smoothed:
+    """Give the rows of last passes' paths."""
+    last, problems = tracks[-1], list(dict.fromkeys(said for track in tracks for said in track.problems))
     if not paths:
-        return Smoothed([], track.clock_ns * 1e-9, math.inf, track.problems)
+        return Smoothed([], last.clock_ns * 1e-9, math.inf, problems)
     stamps = sorted(outputs_ns)
-    times_s = np.array([track.between(stamp) for stamp in stamps])
-    clock_s = track.clock_ns * 1e-9 + paths[-1].state(-1).clock_s
+    times_s = np.array([last.between(stamp) for stamp in stamps])
+    clock_s = last.clock_ns * 1e-9 + paths[-1].state(-1).clock_s
     sigma_s = math.sqrt(paths[-1].covariance(-1)[NAV, NAV])
     rows = chain.from_iterable(rows_between(path, times_s, stamps) for path in paths)
-    return Smoothed(rows, clock_s, sigma_s, track.problems, track.lamps.dark())
+    return Smoothed(rows, clock_s, sigma_s, problems, last.lamps.dark())

@@ -19,12 +19,10 @@ from buddyline.solver_service.track.lights import BLOCK, Sight
 from buddyline.solver_service.track.moving import HOLD_S, excerpt
 from buddyline.solver_service.track.output import TrackRow, at_one_time, at_one_time_jacobian, pose_jacobian
 from buddyline.solver_service.track.pool import MAX_TENTATIVE, TrackPool
-from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.start import CLOCK_S, state_from_fix
 from buddyline.solver_service.track.state import CLOCK, State, place_covariance
 from buddyline.solver_service.track.stepping import TICK_S
 from buddyline.solver_service.track.strapdown import kept_shares
-from buddyline.solver_service.track.walking import Walking
 
 # Log odds by which an estimate must explain its pictures better than clutter to be confirmed, and a challenger better
 # than the track to replace it. Each node's pictures alone must give at least MUTUAL.
@@ -86,7 +84,6 @@ class TrackFilter(TrackPool):
     ) -> None:
         super().__init__((node_a, node_b), keep_s, clock_sigma_s)
         self.finished: list[Estimate] = []
-        self._waiting: list[Estimate] = []
         self._refused = 0
         self._apart_s = -np.inf
         self._last_row: tuple[Estimate, Forecast] | None = None
@@ -121,7 +118,7 @@ class TrackFilter(TrackPool):
                 self._take_sight(t_s, what)
         if math.isinf(self._keep_s):
             # Without rows in between, an estimate stays where the last picture was.
-            end_s = min([end_s, *(estimate.t_s for estimate in [*self._estimates(), *self._waiting[:1]])])
+            end_s = min([end_s, *(estimate.t_s for estimate in self._estimates())])
         self._forget_before(end_s - MEMORY_S)
 
     def present(self, t_s: float) -> Forecast | None:
@@ -187,12 +184,8 @@ class TrackFilter(TrackPool):
     def _take_sight(self, t_s: float, sight: Sight) -> None:
         self._check_units(t_s)
         self._remember(t_s, sight)
-        if self._waiting and t_s >= self._waiting[0].t_s:
-            if self.main is not None:
-                self.finished.append(self.main)
-            self.main = self._waiting.pop(0)
         for estimate in self._estimates():
-            if t_s >= estimate.t_s and t_s > estimate.start_s + estimate.skip_s and t_s < estimate.end_s:
+            if t_s >= estimate.t_s and t_s > estimate.start_s + estimate.skip_s:
                 if estimate.unseen_by == sight.node and not estimate.confirmed:
                     self._fork(estimate, t_s, sight)
                 if not estimate.confirmed:
@@ -206,8 +199,6 @@ class TrackFilter(TrackPool):
         self._search_window(t_s)
 
     def _take_fix(self, t_s: float, fix: FixSeen) -> None:
-        if not self.restarts:
-            return
         self._fix_s = t_s
         agreed = False
         for estimate in self._estimates():
@@ -271,32 +262,10 @@ class TrackFilter(TrackPool):
         noise = anchors.attitude_covariance(seen.R_ned_body, np.hypot(seen.sigma_rad, IRON_RAD), 1.0, 1.0)
         return float(y @ np.linalg.solve(noise + H @ P @ H.T, y)) < CONTRADICTS
 
-    def begin(self, t_s: float, end_s: float, state: State, P: Floats, shaking: Shaking, walking: Walking) -> None:
-        """Start from a state that is known beforehand, confirmed; a later one takes over at its time.
-
-        walking: as it was learned; it is not learned further, nor are shares.
-        """
-        estimate = Estimate(
-            t_s,
-            state,
-            P,
-            t_s,
-            confirmed=True,
-            end_s=end_s,
-            skip_s=0.0,
-            evidence=CONFIRMED,
-            light_s=t_s,
-            shaking=shaking,
-            walking=walking,
-            learns=False,
-        )
-        self._open(estimate)
-        self._waiting.append(estimate)
-
     def _judge(self, t_s: float) -> None:
         """Confirm, replace or give up, by how well each estimate has explained the pictures."""
         main = self.main
-        if main is not None and main.confirmed and t_s - main.light_s > LOST_S and self.restarts:
+        if main is not None and main.confirmed and t_s - main.light_s > LOST_S:
             range_m = float(np.linalg.norm(main.state.r_m))
             sigma_m = math.sqrt(float(np.trace(place_covariance(main.state, main.covariance))))
             if sigma_m > LOST_SHARE * min(range_m, LOST_RANGE_M):
@@ -320,8 +289,6 @@ class TrackFilter(TrackPool):
                     return
             recent = [one for one in self.challengers if t_s - one.start_s < one.patience_s]
             self.challengers = self._thinned(t_s, recent)
-            return
-        if not self.restarts:
             return
         pool = self._thinned(t_s, self._estimates())
         best = max(

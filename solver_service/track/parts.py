@@ -17,8 +17,10 @@ NEAR_CLOCK_S: Final = 0.005
 MOST_LEFT_S: Final = 0.06
 # An offset differs from the assumed one where it is so many sigmas off.
 TOLD_SIGMAS: Final = 6.0
-# One of several tracks goes on where it lasts for so much of the time.
+# Of several tracks those of one offset are enough where they last for so much of the time that all do: of the dive, if
+# they last for less than LONG_S.
 NEARLY_ALL: Final = 0.9
+LONG_S: Final = 20.0
 # Tracks are in pieces where their offsets differ by more than so many s, and so many sigmas.
 PIECES_S: Final = 0.1
 PIECES_SIGMAS: Final = 4.0
@@ -35,15 +37,17 @@ def parts_of(track: TrackFilter) -> list[Estimate]:
 
 
 def goes_on(parts: Sequence[Estimate]) -> bool:
-    """Whether one of a dive's tracks is nearly all of it, with the clocks' offset settled: the others are false starts.
+    """Whether tracks of one settled offset of the clocks are nearly all of a dive's tracks; others are false starts.
 
     With a wrong offset tracks are replaced after seconds, or go on but ask for another offset in each pass.
     """
     if len(parts) < 2:
         return True
     longest = max(parts, key=lasted_s)
+    settled = [part for part in parts if not disagree(longest, part, NEAR_CLOCK_S) and not clock_left_ns([part])]
+    together_s, all_s = (sum(map(lasted_s, some)) for some in (settled, parts))
     whole_s = max(part.t_s for part in parts) - min(part.start_s for part in parts)
-    return lasted_s(longest) > NEARLY_ALL * whole_s and not clock_left_ns([longest])
+    return together_s > NEARLY_ALL * (all_s if together_s > LONG_S else whole_s) and longest in settled
 
 
 def lasted_s(part: Estimate) -> float:

@@ -53,7 +53,7 @@ REPLAYS: Final = 2
 class TrackPool(TrackSteps):
     """Holds the main estimate and its challengers, and finds starts without a fix.
 
-    restarts: whether there may be other estimates than those given. searches: whether any may start without a fix.
+    searches: whether any may start without a fix.
     """
 
     def __init__(self, nodes: tuple[TrackNode, TrackNode], keep_s: float, clock_sigma_s: float = CLOCK_S) -> None:
@@ -61,7 +61,7 @@ class TrackPool(TrackSteps):
         self.clock_sigma_s = clock_sigma_s
         self.main: Estimate | None = None
         self.challengers: list[Estimate] = []
-        self.restarts = self.searches = True
+        self.searches = True
         self.lamps = LampWatch()
         self._sights: deque[tuple[float, Sight]] = deque()
         self._searched_s, self._searched_of, self._windowed_s = -np.inf, 1, -np.inf
@@ -163,7 +163,7 @@ class TrackPool(TrackSteps):
             every_s = SEARCH_BESIDE_S if max(self.main.missed) > ONE_SIDED and min(self.main.missed) == 0 else math.inf
         # Of both nodes in turn: one of them sees a single light where a lamp of the other is dead.
         again = sight.node == self._searched_of
-        if not (self.restarts and self.searches) or t_s - self._searched_s < (2 if again else 1) * every_s:
+        if not self.searches or t_s - self._searched_s < (2 if again else 1) * every_s:
             return
         if self._fix_s == -np.inf:
             self._fix_s = t_s - SEARCH_AFTER_S + 0.5
@@ -200,12 +200,7 @@ class TrackPool(TrackSteps):
         """
         since_s = max(t_s - WINDOW_S, self._sights[0][0] - 0.001)
         followed = self.main is not None and self.main.confirmed
-        if (
-            followed
-            or not (self.restarts and self.searches)
-            or t_s - since_s < LEAST_WINDOW_S
-            or math.isfinite(self._keep_s)
-        ):
+        if followed or not self.searches or t_s - since_s < LEAST_WINDOW_S or math.isfinite(self._keep_s):
             return
         if t_s - self._fix_s < SEARCH_AFTER_S or t_s - self._windowed_s < WINDOW_EVERY_S:
             return
@@ -271,7 +266,9 @@ class TrackPool(TrackSteps):
                 self._update_lights(child, Association(chosen, np.ones(2), 0.0), y, H, sight)
                 child.used[sight.node, sight.stamp_ns] = chosen
                 if child.steps:
-                    child.steps.last = replace(child.steps.last, after=child.state, covariance=child.covariance)
+                    child.steps.last = replace(
+                        child.steps.last, after=child.state.to_row(), covariance=child.covariance
+                    )
                 self.challengers.append(child)
 
     def _force(self, estimate: Estimate, sight: Sight, chosen: Chosen) -> None:

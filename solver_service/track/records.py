@@ -10,8 +10,9 @@ from typing import Final, TypeAlias, TypeVar
 import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.solver_service.geometry.rotation import Floats
-from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, Stamps, TrackNode
+from buddyline.solver_service.track.intake import TrackIntake
+from buddyline.solver_service.track.stepping import TrackSteps
 from buddyline.solver_service.track.vibration import fast_part, sudden_turn
 
 # A dive is fed in pieces of this length, each further than the filter is brought: samples are needed ahead of it.
@@ -107,7 +108,7 @@ def last_ns(records: Records) -> int:
     return max(stamps) + 1_000_000_000
 
 
-def feed(track: TrackFilter, node: int, record: NodeRecord) -> None:
+def feed(track: TrackIntake, node: int, record: NodeRecord) -> None:
     """Give a filter what a node recorded."""
     track.add_imu(node, record.imu_stamps_ns, record.accel_mps2, record.gyro_radps, record.fast)
     for attitude in record.attitudes:
@@ -119,7 +120,7 @@ def feed(track: TrackFilter, node: int, record: NodeRecord) -> None:
 
 
 def pass_over(
-    track: TrackFilter,
+    track: TrackSteps,
     records: Records,
     fixes: Sequence[FixSeen],
     start_ns: int = BEGINNING_NS,

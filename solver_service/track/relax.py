@@ -1,169 +1,324 @@
 """A whole dive at once, linear about an earlier pass's path: Gauss-Newton by a filter and a smoother of its errors.
 
-A track of one lamp each begins with a range that is a fifth off. A filter that is linear at its own estimates goes
-astray from there. Here every step and every light is linear about the path of the pass before, and all that moves is
-the error against that path: a linear problem, solved exactly. Repeated, it comes to the likeliest path of the dive.
+A filter is linear at its own estimates, of which the first of a dive are the worst. Here every step and every light is
+linear about the path of the pass before, and all that moves is the error against that path: a linear problem, solved
+exactly. Repeated, it comes to the likeliest path of the dive. How a known path goes on and where it has the lights does
+not depend on what is filtered, so that is worked out for many steps at once.
 """
 
 from __future__ import annotations
 
+import heapq
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from buddyline.protocol.clock import S_NS
 from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.track.ahead import told_steps
+from buddyline.solver_service.track.association import Association
 from buddyline.solver_service.track.estimate import Estimate
-from buddyline.solver_service.track.filter import TrackFilter
-from buddyline.solver_service.track.inputs import TrackNode
-from buddyline.solver_service.track.lights import Sight
+from buddyline.solver_service.track.lamps import LampWatch
+from buddyline.solver_service.track.lights import Sight, in_picture, pixel_of
+from buddyline.solver_service.track.moving import HOLD_S
 from buddyline.solver_service.track.records import Records, pass_over
 from buddyline.solver_service.track.search import FURTHEST_M
-from buddyline.solver_service.track.seeing import PassGuide
+from buddyline.solver_service.track.seeing import (
+    EDGE_PX,
+    ONE_TRIGGER_S,
+    BySight,
+    PassGuide,
+    in_front,
+    learn_detection,
+    light_rows,
+    told_by,
+)
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.smoother import Path, smoothed
-from buddyline.solver_service.track.start import BROAD_TURN_RAD, constants_of
-from buddyline.solver_service.track.state import MOVING, NAV, PHI, R_, of_place
-from buddyline.solver_service.track.trail import Look, Step
+from buddyline.solver_service.track.start import broad_start, constants_of
+from buddyline.solver_service.track.state import MOVING, NAV, R_, State
+from buddyline.solver_service.track.stepping import DEPTH_GATE, TrackSteps
+from buddyline.solver_service.track.strapdown import (
+    integrate,
+    noise_of_steps,
+    predicted,
+    propagate,
+    sampled,
+)
+from buddyline.solver_service.track.trail import Look, Step, Trail
+from buddyline.solver_service.track.walking import Walking
 
 # What is believed of the place at first, 1 sd, as a share of the range.
 BROAD_SHARE: Final = 0.5
-# A track that began with single lamps, or late, is passed over so often at most, until a pass moves no pose by so
-# many sigmas. It is one where chi^2 of each residual is below UNFIT, on average, and it takes LEAST_TOLD of the lights
-# of the first.
-LONE_PASSES: Final = 12
-STAYS_SIGMAS: Final = 0.3
+# A dive is passed over so often at most, until a pass moves no pose by so many sigmas: the next one then moves them by
+# a fifth of that or less. Tracks that began with single lamps, or late, settle more slowly, and may settle at a wrong
+# one: there is a track where chi^2 of each residual is below UNFIT, on average, and the last pass takes LEAST_TOLD of
+# the lights of the first.
+PASSES: Final = 12
+STAYS_SIGMAS: Final = 1.0
+DOUBTFUL_SIGMAS: Final = 0.3
 LOOKED_AT: Final = 10
+# Noise and units are judged by the samples of two seconds.
+KEPT_S: Final = 3.0
 UNFIT: Final = 1.5
 LEAST_TOLD: Final = 0.5
 
 
-class PathFilter(TrackFilter):
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What a first pass has told of a dive, beside its path.
+
+    epoch_ns: of the path's times. clock_ns: how far B's clock is believed ahead. shares (2, 2): as `take_off` takes
+    them. walking: how far biases walk. unrest: as in TrackMoves.
+    """
+
+    records: Records
+    epoch_ns: int
+    clock_ns: int
+    shares: Floats
+    walking: Walking
+    unrest: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Told:
+    """A step that samples tell, about a path.
+
+    F (MOVING, SIZE), walk (SIZE - MOVING,), rates_radps (2, 3): how it goes on; missed (SIZE,): by what error it misses
+    the path. Q (MOVING, MOVING): noise, of which shaken (3, MOVING, MOVING) is what units add that are shaken as at the
+    start of its run. lost (3,): what the samples' shares take off a camera's own turns, over that shaking.
+    """
+
+    F: Floats
+    Q: Floats
+    walk: Floats
+    shaken: Floats
+    rates_radps: Floats
+    missed: Floats
+    lost: Floats
+
+
+class PathPass(TrackSteps):
     """Filters the errors against a path, whose steps it repeats.
 
     detection (2, 2): how likely each light is found. passed: the estimate, to be smoothed about the same path.
     """
 
-    def __init__(self, nodes: tuple[TrackNode, TrackNode], path: Path, detection: Floats, shaking: Shaking) -> None:
-        super().__init__(*nodes, keep_s=math.inf)
-        self.restarts = False
-        self._path = path
+    def __init__(self, known: Known, path: Path, detection: Floats, shaking: Shaking) -> None:
+        super().__init__((known.records[0].node, known.records[1].node), keep_s=math.inf)
+        self.epoch_ns, self.clock_ns, self.unrest = known.epoch_ns, known.clock_ns, known.unrest
+        self.take_off(known.shares)
+        self.lamps = LampWatch()
         self.guide_by(path)
-        first = path.state(0)
-        # Constants and walks are believed as at first, whatever a pass before made of the same lights: where that went
-        # astray it has learned too small a walk.
-        told, variances = constants_of(nodes, first.R, first.r_m)
-        P = np.diag(variances)
-        P[R_, R_] = (BROAD_SHARE * float(np.linalg.norm(first.r_m))) ** 2 * np.eye(3)
-        level = BROAD_TURN_RAD**2 * np.eye(3)
-        P[PHI[0], PHI[0]] = P[PHI[0], PHI[1]] = P[PHI[1], PHI[0]] = level
-        P[PHI[1], PHI[1]] = level + BROAD_TURN_RAD**2 * np.eye(3)
-        start_s = float(path.t_s[0])
-        self._off = told.minus(first)
-        self.passed = self.main = Estimate(
+        first, start_s = path.state(0), float(path.t_s[0])
+        # Constants are believed as at first, whatever a pass before made of the same lights.
+        told, _ = constants_of(self.nodes, first.R, first.r_m)
+        place_m = BROAD_SHARE * float(np.linalg.norm(first.r_m))
+        _, P = broad_start(self.nodes, first, shaking=shaking, place_m=place_m)
+        self.passed = Estimate(
             start_s,
             first,
-            of_place(first, P),
+            P,
             start_s,
             confirmed=True,
             light_s=start_s,
             detection=detection.copy(),
             shaking=shaking,
+            walking=known.walking,
             learns=False,
         )
-        self._k = 0
+        self._path, self._k, self._off = path, 0, told.minus(first)
         self._open(self.passed)
-        self._close(self.passed)
+        self.passed.steps.last = replace(self.passed.steps.last, before=self._off, after=self._off)
+        # The shaking that a run's steps are worked out with.
+        self._shaking = shaking.variances
 
-    def _take_sight(self, t_s: float, sight: Sight) -> None:
-        self._check_units(t_s)
-        guide = self.guides.get((sight.node, sight.stamp_ns))
-        if guide is None:
-            return
-        while self._k < guide.step:
-            self._next(self.passed)
-        self._see(self.passed, sight, guide)
+    def advance(self, to_ns: int) -> None:
+        """Go on to to_ns, up to which all has been added."""
+        end_s = self.seconds(0, to_ns) - HOLD_S
+        # Pictures between which no unit is found faulty, or well again.
+        run: list[tuple[PassGuide, Sight]] = []
+        while self._events and self._events[0][0] <= end_s:
+            t_s, _, _, sight = heapq.heappop(self._events)
+            trusted = [samples.trusted for samples in self.samples]
+            self._check_units(t_s)
+            now = [samples.trusted for samples in self.samples]
+            if run and now != trusted:
+                self._trust(trusted)
+                self._take_run(run)
+                self._trust(now)
+                run = []
+            guide = self.guides.get((sight.node, sight.stamp_ns)) if isinstance(sight, Sight) else None
+            if guide is not None and isinstance(sight, Sight):
+                run.append((guide, sight))
+        if run:
+            self._take_run(run)
+        self._forget_before(self.passed.t_s - KEPT_S)
 
-    def _next(self, main: Estimate) -> None:
+    def _trust(self, trusted: Sequence[bool]) -> None:
+        for samples, well in zip(self.samples, trusted, strict=True):
+            samples.trusted = well
+
+    def _take_run(self, guided: Sequence[tuple[PassGuide, Sight]]) -> None:
+        by_step: dict[int, list[tuple[Sight, BySight]]] = {}
+        for node in (0, 1):
+            of_node = [one for one in guided if one[1].node == node]
+            found = self._by_path(self._path, of_node) if of_node else []
+            for (guide, sight), by_path in zip(of_node, found, strict=True):
+                by_step.setdefault(guide.step, []).append((sight, by_path))
+        last, steps = max(by_step), self.passed.steps
+        told = self._told_to(last)
+        if self._k in by_step:
+            steps.last = self._seen(steps.last, by_step[self._k])
+        while self._k < last:
+            step = self._next(told.get(self._k))
+            steps.append(self._seen(step, by_step.get(self._k, ())))
+            steps.pack()
+
+    def _told_to(self, last: int) -> dict[int, _Told]:
+        """Work out the steps to the path's last one, where samples tell them, by the step that each starts from."""
+        path, first, main = self._path, self._k, self.passed
+        if last == first:
+            return {}
+        times_s, delays_s = path.t_s[first : last + 1], path.state(first).delay_s
+        steps = told_steps(self.samples, delays_s, times_s, HOLD_S)
+        if not len(steps.told):
+            return {}
+        at = first + steps.told
+        states, span_s = State.of_row(path.states[at]), np.diff(times_s)[steps.told]
+        names = ("R", "gyro_bias_radps", "accel_bias_mps2", "mount_rad", "lever_m", "delay_s")
+        of_nodes = {name: (each := getattr(states, name)).reshape(-1, *each.shape[2:]) for name in names}
+        found = integrate(replace(states, **of_nodes), replace(steps.grid, fast=None))
+        columns = {name: each for name, each in vars(found).items() if each is not None}
+        parts = replace(found, **{name: each.reshape(-1, 2, *each.shape[1:]) for name, each in columns.items()})
+        after, F = propagate(states, parts, span_s)
+        noises = [self._noises(main, t_s) for t_s in path.t_s[at + 1].tolist()]
+        densities, variances = np.stack([sampled(each) for each in noises], axis=1), main.shaking.variances
+        Q, walk, shaken = noise_of_steps(after, parts, densities, np.tile(variances, (len(at), 1)), span_s)
+        missed = after.minus(State.of_row(path.states[at + 1]))
+        sudden_rad = steps.values[..., 12].max(axis=2)
+        lost = np.array([self._with_sudden(np.zeros(3), turn) for turn in sudden_rad]) / variances
+        self._shaking = variances
+        rows = zip(F, Q, walk, shaken, parts.rate_radps, missed, lost, strict=True)
+        return {k: _Told(*row) for k, row in zip(at.tolist(), rows, strict=True)}
+
+    def _next(self, told: _Told | None) -> Step:
         """Go to the path's next step: its state there, and how far off that what is filtered is."""
+        main, path = self.passed, self._path
         self._k += 1
-        at_s, there = float(self._path.t_s[self._k]), self._path.state(self._k)
-        F, Q, walk = self._move(main, at_s)
-        off = self._off.copy()
-        off[:MOVING] = F @ self._off
-        self._off = off + main.state.minus(there)
+        at_s, there = float(path.t_s[self._k]), path.state(self._k)
+        if told is None or any(main.without):
+            F, Q, walk = self._move(main, at_s)
+            missed = main.state.minus(there)
+        else:
+            F, walk, missed = told.F, told.walk, told.missed
+            learned = main.shaking.variances / self._shaking
+            Q = told.Q + np.tensordot(learned + told.lost - 1.0, told.shaken, 1)
+            onward = F[:, :MOVING]
+            main.shaken = onward @ main.shaken @ onward.T + learned[:, None, None] * told.shaken
+            main.covariance = predicted(main.covariance, F, Q, walk)
+            main.t_s, main.rates_radps = at_s, told.rates_radps
         main.state = there
-        before = there.plus(self._off)
-        self._take_depth(main, at_s)
+        before = self._off + missed
+        before[:MOVING] += F @ self._off - self._off[:MOVING]
+        self._off = before
         self._take_attitude(main, at_s)
-        after = there.plus(self._off)
-        step = Step(at_s, before, after, main.covariance, F, Q, walk, main.rates_radps, main.light_s, main.lights)
-        main.steps.append(step)
-        main.steps.pack()
+        self._take_turning(main, at_s)
+        return Step(at_s, before, before, main.covariance, F, Q, walk, main.rates_radps, main.light_s, main.lights)
 
-    def _close(self, main: Estimate) -> None:
-        """Write what the last step's pictures have told into it."""
-        main.steps.last = replace(
-            main.steps.last,
-            after=main.state.plus(self._off),
+    def _seen(self, step: Step, seen: Sequence[tuple[Sight, BySight]]) -> Step:
+        """Take the depths and the pictures of a step together."""
+        main = self.passed
+        rows: list[tuple[Floats, Floats, Floats]] = []
+        looks: list[Look] = []
+        lights: list[tuple[float, int, int]] = []
+        depth = self._depth_of(main, step.t_s)
+        if depth is not None:
+            y, H, variance = depth
+            off = float(y[0] - H[0] @ self._off)
+            if off * off < DEPTH_GATE * (float(H[0] @ main.covariance @ H[0]) + variance):
+                rows.append((H, y, np.array((variance,))))
+        for sight, by_path in seen:
+            main.trigger = [one for one in main.trigger if abs(sight.t_s - one[0]) < ONE_TRIGGER_S]
+            found = self._associated(sight, by_path)
+            looks.append(Look(sight.node, sight.stamp_ns, sight.t_s, found.chosen))
+            if found.chosen:
+                rows.append(light_rows(found.chosen, by_path.y, by_path.H))
+                used = [(sight.t_s, sight.node, light) for _, light, _ in found.chosen]
+                lights += used
+                main.trigger += used
+                main.told_by[sight.node] += 1
+        if rows:
+            H, y = np.concatenate([each[0] for each in rows]), np.concatenate([each[1] for each in rows])
+            noise = np.diag(np.concatenate([each[2] for each in rows]))
+            error, chi2 = told_by(main, H, y - H @ self._off, noise, teaches=bool(lights))
+            self._off = self._off + error
+            if lights:
+                main.surprise += chi2
+                main.told += len(y)
+                main.light_s = max(main.light_s, *(t_s for t_s, _, _ in lights))
+        return replace(
+            step,
+            after=self._off,
             covariance=main.covariance,
             light_s=main.light_s,
             lights=main.lights,
+            looks=(*step.looks, *looks),
         )
 
-    def _see(self, main: Estimate, sight: Sight, guide: PassGuide) -> None:
-        observer = sight.node
-        found = self._odds(guide, sight).associate(sight.sigma_px, main.detection[observer])
+    def _associated(self, sight: Sight, by_path: BySight) -> Association:
+        """Decide which of a picture's candidates are lights, by the path."""
+        main, observer, camera = self.passed, sight.node, self.nodes[sight.node].rig.camera
+        inside = [in_picture(camera, pixel_of(camera, X), EDGE_PX) for X in by_path.X]
+        detection = main.detection[observer] * np.where(inside, 1.0, 0.02)
+        found = by_path.odds.associate(sight.sigma_px, detection)
         main.evidence += found.evidence
-        for light in (0, 1):
-            old = main.detection[observer, light]
-            main.detection[observer, light] = min(max(old + 0.05 * (found.seen[light] - old), 0.02), 0.97)
-        _, y, H = self._compared(sight, main.state, main.rates_radps, sight.t_s - main.t_s)
-        self.lamps.take(1 - observer, sight.t_s, found.seen)
-        if found.chosen:
-            self._update_lights(main, found, y, H, sight)
-            main.told_by[observer] += 1
-        self._close(main)
-        looks = (*main.steps.last.looks, Look(observer, sight.stamp_ns, sight.t_s, found.chosen))
-        main.steps.last = replace(main.steps.last, looks=looks)
+        learn_detection(main.detection[observer], inside, found.seen)
+        if all(inside):
+            self.lamps.take(1 - observer, sight.t_s, found.seen)
+        return replace(found, chosen=in_front(found.chosen, by_path.y))
 
-    def _apply(  # type: ignore[override]
-        self, estimate: Estimate, H: Floats, y: Floats, noise: Floats, *, teaches: bool = False
-    ) -> float:
-        at = estimate.state
-        chi2 = TrackFilter._apply(estimate, H, y - H @ self._off, noise, teaches=teaches)
-        self._off = self._off + estimate.state.minus(at)
-        estimate.state = at
+    def _apply(self, estimate: Estimate, H: Floats, y: Floats, noise: Floats, *, teaches: bool = False) -> float:
+        error, chi2 = told_by(estimate, H, y - H @ self._off, noise, teaches=teaches)
+        self._off = self._off + error
         return chi2
 
 
 def settled(
-    path: Path, detection: Floats, told: int, records: Records, clock_ns: int, shaking: Shaking, shares: Floats
-) -> tuple[PathFilter, Path] | None:
+    path: Path, detection: Floats, shaking: Shaking, known: Known, told: int, *, doubtful: bool
+) -> tuple[PathPass, Path] | None:
     """Pass over a dive about the last pass's path until that does not move; None where it does not settle.
 
-    told: the pictures that the first pass used.
+    told: the pictures that the first pass used. doubtful: whether the path may be far off throughout.
     """
-    for _ in range(LONE_PASSES):
-        track = PathFilter((records[0].node, records[1].node), path, detection, shaking)
-        track.clock_ns = clock_ns
-        track.take_off(shares)
+    start_ns, end_ns = (known.epoch_ns + round(t_s * 1e9) for t_s in (path.t_s[0], path.t_s[-1]))
+    a, b = known.records
+    shift_ns = known.clock_ns
+    records = (
+        a.between(start_ns - S_NS, end_ns + S_NS),
+        b.between(start_ns - S_NS + shift_ns, end_ns + S_NS + shift_ns),
+    )
+    for _ in range(PASSES):
+        track = PathPass(known, path, detection, shaking)
         pass_over(track, records, ())
-        found = track.passed
-        old, path, detection = path, smoothed(found.steps, path), found.detection
+        passed = track.passed
+        old, path, detection = path, smoothed(passed.steps, path), passed.detection
+        # Every step holds a covariance: those of two passes take twice the memory.
+        passed.steps = Trail()
         if not bool(np.isfinite(path.states).all()):
             return None
-        if _stays(old, path):
-            fits = found.surprise < UNFIT * found.told and sum(found.told_by) > LEAST_TOLD * told
+        if _stays(old, path, DOUBTFUL_SIGMAS if doubtful else STAYS_SIGMAS):
+            fits = passed.surprise < UNFIT * passed.told and sum(passed.told_by) > LEAST_TOLD * told
             near = np.linalg.norm(path.states[:, R_], axis=1).max() < FURTHEST_M
-            return (track, path) if fits and near else None
+            return (track, path) if near and (fits or not doubtful) else None
     return None
 
 
-def _stays(old: Path, new: Path) -> bool:
-    """Whether a pass over a dive has left each pose where the pass before had it, by its covariance."""
-    for k in range(0, len(new), LOOKED_AT):
-        moved = new.state(k).minus(old.state(k))[:NAV]
-        if not moved @ np.linalg.solve(new.covariance(k)[:NAV, :NAV], moved) < NAV * STAYS_SIGMAS**2:
-            return False
-    return True
+def _stays(old: Path, new: Path, sigmas: float) -> bool:
+    """Whether a pass over a dive has left each pose within so many sigmas of where the pass before had it."""
+    at = np.arange(0, len(new), LOOKED_AT)
+    moved = State.of_row(new.states[at]).minus(State.of_row(old.states[at]))[:, :NAV, None]
+    chi2 = np.swapaxes(moved, 1, 2) @ np.linalg.solve(new.covariance(at)[:, :NAV, :NAV], moved)
+    return bool((chi2 < NAV * sigmas**2).all())

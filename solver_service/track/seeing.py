@@ -45,8 +45,6 @@ EDGE_PX: Final = 2.0
 WIDE_SHARE: Final = 0.02
 # A wide estimate takes its lights in so many steps.
 ABOUT_STEPS: Final = 4
-# The odds of so many pictures are worked out together at most.
-MOST_TOGETHER: Final = 256
 _STILL: Final = np.eye(MOVING)
 
 
@@ -62,13 +60,26 @@ class PassGuide:
     look: Look
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class BySight:
+    """What a path says of one picture.
+
+    X (L, 3): the lights, camera frame. y (K, L, 2), H (K, L, 2, C): residuals and Jacobians. odds: its candidates', by
+    the path without what the picture has told it.
+    """
+
+    X: Floats
+    y: Floats
+    H: Floats
+    odds: Odds
+
+
 class TrackSights(TrackMoves):
     """Updates estimates by pictures. guides: by node and stamp of a picture."""
 
     def __init__(self, nodes: tuple[TrackNode, TrackNode]) -> None:
         super().__init__(nodes)
         self.guides: dict[tuple[int, int], PassGuide] = {}
-        self._by_all: dict[tuple[int, int], tuple[PassGuide, Odds]] = {}
 
     def guide_by(self, path: Path) -> None:
         """Tell what a pass knew at each picture."""
@@ -101,11 +112,12 @@ class TrackSights(TrackMoves):
         elif guide is None:
             found = associate(y, H, estimate.covariance[BLOCK], sight.sigma_px, detection, clutter)
         else:
-            found = self._odds(guide, exact).associate(sight.sigma_px, detection)
+            [by_path] = self._by_path(guide.path, [(guide, exact)])
+            found = by_path.odds.associate(sight.sigma_px, detection)
         if wide and found.chosen and estimate.confirmed:
             y, H = self._about(estimate, sight, found.chosen, guide)
         # What another estimate chose may be behind the camera by this one.
-        if len(chosen := _in_front(found.chosen, y)) < len(found.chosen):
+        if len(chosen := in_front(found.chosen, y)) < len(found.chosen):
             found = replace(found, chosen=chosen)
         estimate.trigger = [seen for seen in estimate.trigger if abs(sight.t_s - seen[0]) < ONE_TRIGGER_S]
         estimate.evidence += found.evidence
@@ -113,10 +125,7 @@ class TrackSights(TrackMoves):
         if any(inside) and not wide:
             estimate.missed[observer] = 0 if found.chosen else estimate.missed[observer] + 1
         estimate.last_seen = found.seen if all(inside) and not wide else None
-        for light in (0, 1):
-            if inside[light]:
-                old = estimate.detection[observer, light]
-                estimate.detection[observer, light] = min(max(old + 0.05 * (found.seen[light] - old), 0.02), 0.97)
+        learn_detection(estimate.detection[observer], inside, found.seen)
         if found.chosen:
             self._update_lights(estimate, found, y, H, sight)
             if not estimate.confirmed:
@@ -138,23 +147,8 @@ class TrackSights(TrackMoves):
         y, H = residuals(sight.bearings, sight.tangents, X, D)
         return X, y, H
 
-    def _odds(self, guide: PassGuide, sight: Sight) -> Odds:
-        """Give the odds of a picture's candidates by all the dive but this picture.
-
-        They depend on the earlier pass alone: those of all pictures that wait are worked out together.
-        """
-        key = sight.node, sight.stamp_ns
-        if self._by_all.get(key, (None,))[0] is not guide:
-            waiting = [what for _, _, _, what in self._events if isinstance(what, Sight) and what.node == sight.node]
-            guided = [(self.guides.get((each.node, each.stamp_ns)), each) for each in waiting]
-            alike = [(by, each) for by, each in guided if by is not None and by.path is guide.path]
-            together = [(guide, sight), *alike[: MOST_TOGETHER - 1]]
-            for (by, each), odds in zip(together, self._odds_by(guide.path, together), strict=True):
-                self._by_all[each.node, each.stamp_ns] = by, odds
-        return self._by_all.pop(key)[1]
-
-    def _odds_by(self, path: Path, seen: Sequence[tuple[PassGuide, Sight]]) -> list[Odds]:
-        """Give the odds of one node's pictures, each by the path without what the picture has told it.
+    def _by_path(self, path: Path, seen: Sequence[tuple[PassGuide, Sight]]) -> list[BySight]:
+        """Give what a path says of one node's pictures, and each picture's odds by the path without what it has told.
 
         That is taken out of the smoothed estimate: P' = P + K H P, K = P H^T (R - H P H^T)^-1.
         """
@@ -174,7 +168,7 @@ class TrackSights(TrackMoves):
         # The rows of lights that a picture did not use stay 0, and tell nothing.
         H_used, y_used, R = np.zeros((len(seen), 4, len(COLUMNS))), np.zeros((len(seen), 4)), np.ones((len(seen), 4))
         for n, (guide, _) in enumerate(seen):
-            for row, (k, light, variance) in enumerate(_in_front(guide.look.chosen, y[n])):
+            for row, (k, light, variance) in enumerate(in_front(guide.look.chosen, y[n])):
                 rows = slice(2 * row, 2 * row + 2)
                 H_used[n, rows], y_used[n, rows], R[n, rows] = H[n, k, light], y[n, k, light], variance
         across = P @ np.swapaxes(H_used, 1, 2)
@@ -184,11 +178,12 @@ class TrackSights(TrackMoves):
         inverse = (vectors / np.maximum(values, 0.02 * R[:, :1])[:, None]) @ np.swapaxes(vectors, 1, 2)
         gain = across @ inverse
         P = P + gain @ np.swapaxes(across, 1, 2)
-        y = y + (H @ (gain @ y_used[..., None])[:, None, None])[..., 0]
+        y_without = y + (H @ (gain @ y_used[..., None])[:, None, None])[..., 0]
         # Candidates that a picture does not have are nowhere.
-        y[~bearings.any(axis=2)] = np.inf
+        y_without[~bearings.any(axis=2)] = np.inf
         area_px2 = self.nodes[observer].rig.camera.area_px2
-        return odds_of(y, H, P, sigma_px, np.array([sight.clutter / area_px2 for _, sight in seen]))
+        odds = odds_of(y_without, H, P, sigma_px, np.array([sight.clutter / area_px2 for _, sight in seen]))
+        return list(map(BySight, X[:, 0], y, H, odds))
 
     def _about(
         self, estimate: Estimate, sight: Sight, chosen: Chosen, guide: PassGuide | None
@@ -204,49 +199,66 @@ class TrackSights(TrackMoves):
             state, after_s = estimate.state.plus(error), sight.t_s - estimate.t_s
             _, y, H = self._compared(sight, state, estimate.rates_radps, after_s)
             y = y + H @ error[COLUMNS]
-            if left and (near := _in_front(chosen, y)):
-                error = anchors.kalman(estimate.covariance, *_rows(near, y, H))[0]
+            if left and (near := in_front(chosen, y)):
+                rows_H, rows_y, variances = light_rows(near, y, H)
+                error = anchors.kalman(estimate.covariance, rows_H, rows_y, np.diag(variances)).error
         return y, H
 
     def _update_lights(self, estimate: Estimate, found: Association, y: Floats, H: Floats, sight: Sight) -> None:
-        rows_H, rows_y, noise = _rows(found.chosen, y, H)
-        chi2 = self._apply(estimate, rows_H, rows_y, noise, teaches=True)
+        rows_H, rows_y, variances = light_rows(found.chosen, y, H)
+        chi2 = self._apply(estimate, rows_H, rows_y, np.diag(variances), teaches=True)
         estimate.surprise += chi2
         estimate.told += len(rows_y)
         estimate.light_s = max(estimate.light_s, sight.t_s)
         estimate.trigger += [(sight.t_s, sight.node, light) for _, light, _ in found.chosen]
 
-    @staticmethod
-    def _apply(estimate: Estimate, H: Floats, y: Floats, noise: Floats, *, teaches: bool = False) -> float:
-        before = estimate.covariance
-        error, estimate.covariance, chi2, S_inverse, gain = anchors.kalman(before, H, y, noise)
+    def _apply(self, estimate: Estimate, H: Floats, y: Floats, noise: Floats, *, teaches: bool = False) -> float:
+        error, chi2 = told_by(estimate, H, y, noise, teaches=teaches)
         estimate.state = estimate.state.plus(error)
-        if estimate.by_shares.any():
-            moved = H @ estimate.by_shares
-            if teaches:
-                estimate.shares = estimate.shares.taught(y, S_inverse, moved)
-            estimate.by_shares = estimate.by_shares - gain @ moved
-        if estimate.follows_walk:
-            learns = before[CLOCK, CLOCK] < KNOWN_CLOCK_S**2 and not (estimate.wide and any(estimate.without))
-            estimate.walking = estimate.walking.taught(y, S_inverse, H, gain, learns=learns)
-        # Depth and attitudes remove little of what shaking adds: to follow that would not be worth its time.
-        if teaches:
-            moving = H[:, :MOVING]
-            estimate.shaking = estimate.shaking.taught(y, S_inverse, moving[:, :NAV], estimate.shaken[:, :NAV, :NAV])
-            rest = _STILL - gain[:MOVING] @ moving
-            estimate.shaken = rest @ estimate.shaken @ rest.T
         return chi2
 
 
-def _rows(chosen: Chosen, y: Floats, H: Floats) -> tuple[Floats, Floats, Floats]:
-    """Give Jacobians (2 N, SIZE), residuals (2 N,) and noise of the chosen candidates, of y and H of all."""
+def told_by(estimate: Estimate, H: Floats, y: Floats, noise: Floats, *, teaches: bool) -> tuple[Floats, float]:
+    """Update all but an estimate's state; give the error (SIZE,) to add to that, and chi^2 of the residuals y (m,).
+
+    teaches: whether shaking and shares learn.
+    """
+    before = estimate.covariance
+    error, estimate.covariance, chi2, S_inverse, gain = anchors.kalman(before, H, y, noise)
+    if estimate.learns and estimate.by_shares.any():
+        moved = H @ estimate.by_shares
+        if teaches:
+            estimate.shares = estimate.shares.taught(y, S_inverse, moved)
+        estimate.by_shares = estimate.by_shares - gain @ moved
+    if estimate.follows_walk:
+        learns = before[CLOCK, CLOCK] < KNOWN_CLOCK_S**2 and not (estimate.wide and any(estimate.without))
+        estimate.walking = estimate.walking.taught(y, S_inverse, H, gain, learns=learns)
+    # Depth and attitudes remove little of what shaking adds: to follow that would not be worth its time.
+    if teaches:
+        moving = H[:, :MOVING]
+        estimate.shaking = estimate.shaking.taught(y, S_inverse, moving[:, :NAV], estimate.shaken[:, :NAV, :NAV])
+        rest = _STILL - gain[:MOVING] @ moving
+        estimate.shaken = rest @ estimate.shaken @ rest.T
+    return error, chi2
+
+
+def learn_detection(detection: Floats, inside: Sequence[bool], seen: Floats) -> None:
+    """Take into detection (2,) whether each light that should be in a picture was seen there (2,)."""
+    for light in (0, 1):
+        if inside[light]:
+            old = detection[light]
+            detection[light] = min(max(old + 0.05 * (seen[light] - old), 0.02), 0.97)
+
+
+def light_rows(chosen: Chosen, y: Floats, H: Floats) -> tuple[Floats, Floats, Floats]:
+    """Give Jacobians (2 N, SIZE), residuals (2 N,) and variances (2 N,) of the chosen candidates, of y and H of all."""
     rows_H = np.zeros((2 * len(chosen), SIZE))
     rows_H[:, COLUMNS] = np.concatenate([H[k, light] for k, light, _ in chosen])
     rows_y = np.concatenate([y[k, light] for k, light, _ in chosen])
-    return rows_H, rows_y, np.diag(np.repeat([variance for _, _, variance in chosen], 2))
+    return rows_H, rows_y, np.repeat([variance for _, _, variance in chosen], 2)
 
 
-def _in_front(chosen: Chosen, y: Floats) -> Chosen:
+def in_front(chosen: Chosen, y: Floats) -> Chosen:
     """Return those candidates of lights that the residuals y (K, 2, 2) have in front of the camera."""
     return tuple(one for one in chosen if np.isfinite(y[one[0], one[1]]).all())
 

@@ -86,6 +86,7 @@ def smoothed(steps: Trail, about: Path | None = None) -> Path:
     """
     count = len(steps)
     looks: list[tuple[Look, ...]] = [()] * count
+    found: list[Floats] = [np.zeros(0)] * count
     path = Path(
         t_s=np.empty(count),
         light_s=np.empty(count),
@@ -99,31 +100,36 @@ def smoothed(steps: Trail, about: Path | None = None) -> Path:
         oldest=np.empty((SIZE, SIZE)),
     )
     later = None
+    # A state's row, or the error against the path.
+    here = np.zeros(0)
     for k, step in zip(range(count - 1, -1, -1), steps.backward(), strict=True):
         if later is None:
-            state, P = step.after, step.covariance
+            here, P = step.after, step.covariance
         else:
             P_before = predicted(step.covariance, later.F, later.Q, later.walk)
             across = step.covariance.copy()
             across[:, :MOVING] = step.covariance @ later.F.T
             gain = np.linalg.solve(P_before, across.T).T
             if about is None:
-                state = step.after.plus(gain @ state.minus(later.before))
+                error = State.of_row(here).minus(State.of_row(later.before))
+                here = State.of_row(step.after).plus(gain @ error).to_row()
             else:
-                there, then = about.state(k), about.state(k + 1)
-                error = gain @ (state.minus(then) - later.before.minus(then))
-                state = there.plus(step.after.minus(there) + error)
+                here = step.after + gain @ (here - later.before)
             P = step.covariance + gain @ (P - P_before) @ gain.T
             P = 0.5 * (P + P.T)
         path.t_s[k], path.light_s[k], path.lights[k] = step.t_s, step.light_s, step.lights
-        path.states[k], path.halves[k] = state.to_row(), P[_BLOCK_UPPER]
+        found[k], path.halves[k] = here, P[_BLOCK_UPPER]
         path.drawn[k], path.without[k] = _drawn(step.Q)
-        # Without a unit the turn rate is estimated, too (strapdown.process_noise).
-        path.rates_radps[k] = np.where(path.without[k][:, None], -state.gyro_bias_radps, step.rates_radps)
+        path.rates_radps[k] = step.rates_radps
         looks[k] = step.looks
         later = step
     if count:
         path.oldest[:] = P
+        states = State.of_row(np.array(found) if about is None else about.states)
+        states = states if about is None else states.plus(np.array(found))
+        path.states[:] = states.to_row()
+        # Without a unit the turn rate is estimated, too (strapdown.process_noise).
+        np.copyto(path.rates_radps, -states.gyro_bias_radps, where=path.without[..., None])
     return path
 
 

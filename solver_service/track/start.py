@@ -89,17 +89,18 @@ def broad_start(
     clock_sigma_s: float = CLOCK_S,
     known: Floats | None = None,
     shaking: Shaking | None = None,
+    place_m: float = BROAD_R_M,
 ) -> tuple[State, Floats]:
     """Give a state to start again from, with a covariance that holds next to nothing of the lights yet.
 
     known (SIZE, SIZE): its covariance by an earlier pass, of which BROAD_SIGMAS are kept: from a broader start the
-    first updates would be far from linear. shaking: as it was learned.
+    first updates would be far from linear. shaking: as it was learned. place_m: 1 sd of the place.
     """
     _, variances = constants_of(nodes, state.R, state.r_m, clock_sigma_s)
     if shaking is not None:
         variances[NAV:MOVING] = np.repeat(shaking.variances, 3)
     P = np.diag(variances)
-    P[R_, R_] = BROAD_R_M**2 * np.eye(3)
+    P[R_, R_] = place_m**2 * np.eye(3)
     level = BROAD_TURN_RAD**2 * np.eye(3)
     P[PHI[0], PHI[0]] = P[PHI[0], PHI[1]] = P[PHI[1], PHI[0]] = level
     P[PHI[1], PHI[1]] = level + BROAD_TURN_RAD**2 * np.eye(3)

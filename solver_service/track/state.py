@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.rotation import Floats, left_jacobian, rotation_exp, rotation_log, skew
+from buddyline.solver_service.geometry.rotation import Floats, applied, left_jacobian, rotation_exp, rotation_log, skew
 
 # Where each error stands in the error state: R_ is the position r's, not a rotation R's, which is PHI. A's part comes
 # first where a quantity belongs to a node.
@@ -66,7 +66,7 @@ class State:
     depth_offset_m: float
 
     def plus(self, error: Floats) -> State:
-        """Return the state that is off this one by an error (SIZE,).
+        """Return the state that is off this one by an error (SIZE,); of a batch, with leading axes.
 
         R_A = exp(phi_A) R_A, R_B = exp(phi_A) exp(psi) R_B with psi = phi_B - phi_A, v = exp(phi_A) (v + dv), shove
         likewise, r = exp(phi_A) (exp(psi) r + J(psi) dr): A turns all, and B goes by the screw (psi, dr) against it.
@@ -74,42 +74,54 @@ class State:
         leave open stays on its circle, however large it is (docs/track.md, consistency). What rounding does to R is
         mended by the next step (strapdown.integrate).
         """
-        psi = error[PHI[1]] - error[PHI[0]]
-        turn = rotation_exp(np.array((error[PHI[0]], psi)))
+        phi = error[..., PHI[0]]
+        psi = error[..., PHI[1]] - phi
+        turn_a, turn_b = rotation_exp(phi), rotation_exp(psi)
+        lead = error.shape[:-1]
+        R = np.empty((*lead, 2, 3, 3))
+        R[..., 0, :, :], R[..., 1, :, :] = turn_a @ self.R[..., 0, :, :], turn_a @ turn_b @ self.R[..., 1, :, :]
+        shake, gyro, accel, mount, lever = (
+            error[..., k : k + 6].reshape(*lead, 2, 3) for k in (SHAKE[0].start, *range(MOVING, DELAY[0], 6))
+        )
         return State(
-            r_m=turn[0] @ (turn[1] @ self.r_m + left_jacobian(psi) @ error[R_]),
-            v_mps=turn[0] @ (self.v_mps + error[V_]),
-            R=turn[0] @ np.array((self.R[0], turn[1] @ self.R[1])),
-            shake_rad=self.shake_rad + error[12:18].reshape(2, 3),
-            shove_mps=turn[0] @ (self.shove_mps + error[SHOVE]),
-            gyro_bias_radps=self.gyro_bias_radps + error[21:27].reshape(2, 3),
-            accel_bias_mps2=self.accel_bias_mps2 + error[27:33].reshape(2, 3),
-            mount_rad=self.mount_rad + error[33:39].reshape(2, 3),
-            lever_m=self.lever_m + error[39:45].reshape(2, 3),
-            delay_s=self.delay_s + error[45:47],
-            clock_s=self.clock_s + float(error[CLOCK]),
-            depth_offset_m=self.depth_offset_m + float(error[DEPTH_OFFSET]),
+            r_m=applied(turn_a, applied(turn_b, self.r_m) + applied(left_jacobian(psi), error[..., R_])),
+            v_mps=applied(turn_a, self.v_mps + error[..., V_]),
+            R=R,
+            shake_rad=self.shake_rad + shake,
+            shove_mps=applied(turn_a, self.shove_mps + error[..., SHOVE]),
+            gyro_bias_radps=self.gyro_bias_radps + gyro,
+            accel_bias_mps2=self.accel_bias_mps2 + accel,
+            mount_rad=self.mount_rad + mount,
+            lever_m=self.lever_m + lever,
+            delay_s=self.delay_s + error[..., DELAY[0] : DELAY[1] + 1],
+            clock_s=self.clock_s + error[..., CLOCK],  # type: ignore[arg-type]
+            depth_offset_m=self.depth_offset_m + error[..., DEPTH_OFFSET],  # type: ignore[arg-type]
         )
 
     def minus(self, other: State) -> Floats:
-        """Return the error (SIZE,) by which this state is off another: other.plus(error) is this one."""
-        error = np.empty(SIZE)
-        error[PHI[0]] = phi = rotation_log(self.R[0] @ other.R[0].T)
+        """Return the error (SIZE,) by which this state is off another: other.plus(error) is this one.
+
+        Of batches, with leading axes.
+        """
+        error = np.empty((*self.r_m.shape[:-1], SIZE))
+        flat = (*error.shape[:-1], 6)
+        phi = rotation_log(self.R[..., 0, :, :] @ np.swapaxes(other.R[..., 0, :, :], -1, -2))
         back = rotation_exp(-phi)
-        turn = back @ self.R[1] @ other.R[1].T
+        turn = back @ self.R[..., 1, :, :] @ np.swapaxes(other.R[..., 1, :, :], -1, -2)
         psi = rotation_log(turn)
-        error[PHI[1]] = phi + psi
-        error[R_] = np.linalg.solve(left_jacobian(psi), back @ self.r_m - turn @ other.r_m)
-        error[V_] = back @ self.v_mps - other.v_mps
-        error[12:18] = (self.shake_rad - other.shake_rad).ravel()
-        error[SHOVE] = back @ self.shove_mps - other.shove_mps
-        error[21:27] = (self.gyro_bias_radps - other.gyro_bias_radps).ravel()
-        error[27:33] = (self.accel_bias_mps2 - other.accel_bias_mps2).ravel()
-        error[33:39] = (self.mount_rad - other.mount_rad).ravel()
-        error[39:45] = (self.lever_m - other.lever_m).ravel()
-        error[45:47] = self.delay_s - other.delay_s
-        error[CLOCK] = self.clock_s - other.clock_s
-        error[DEPTH_OFFSET] = self.depth_offset_m - other.depth_offset_m
+        error[..., PHI[0]], error[..., PHI[1]] = phi, phi + psi
+        along = applied(back, self.r_m) - applied(turn, other.r_m)
+        error[..., R_] = np.linalg.solve(left_jacobian(psi), along[..., None])[..., 0]
+        error[..., V_] = applied(back, self.v_mps) - other.v_mps
+        error[..., 12:18] = (self.shake_rad - other.shake_rad).reshape(flat)
+        error[..., SHOVE] = applied(back, self.shove_mps) - other.shove_mps
+        error[..., 21:27] = (self.gyro_bias_radps - other.gyro_bias_radps).reshape(flat)
+        error[..., 27:33] = (self.accel_bias_mps2 - other.accel_bias_mps2).reshape(flat)
+        error[..., 33:39] = (self.mount_rad - other.mount_rad).reshape(flat)
+        error[..., 39:45] = (self.lever_m - other.lever_m).reshape(flat)
+        error[..., 45:47] = self.delay_s - other.delay_s
+        error[..., CLOCK] = self.clock_s - other.clock_s
+        error[..., DEPTH_OFFSET] = self.depth_offset_m - other.depth_offset_m
         return error
 
     def to_row(self) -> Floats:

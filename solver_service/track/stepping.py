@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import heapq
 import math
+from abc import abstractmethod
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.rotation import rotation_exp
+from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
 from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.ahead import StepsAhead, steps_ahead
 from buddyline.solver_service.track.estimate import Estimate
@@ -33,6 +34,8 @@ MOST_TOGETHER: Final = 64
 # Longest step without a frame.
 TICK_S: Final = 0.1
 ATTITUDE_EVERY_S: Final = 0.5
+# A depth that is four sigmas off is left out.
+DEPTH_GATE: Final = 16.0
 
 
 class TrackSteps(TrackSights):
@@ -49,6 +52,10 @@ class TrackSteps(TrackSights):
         self._ahead: StepsAhead | None = None
         self._together = 1
         self._ports = np.stack([node.rig.depth_port_m for node in nodes])
+
+    @abstractmethod
+    def advance(self, to_ns: int) -> object:
+        """Go on to to_ns, up to which all has been added."""
 
     def _step(self, estimate: Estimate, t_s: float, sight: Sight | None) -> None:
         """Bring an estimate to t_s, by ticks where that is long, and update it."""
@@ -71,7 +78,7 @@ class TrackSteps(TrackSights):
             last = estimate.steps.last
             estimate.steps.last = replace(
                 last,
-                after=estimate.state,
+                after=estimate.state.to_row(),
                 covariance=estimate.covariance,
                 light_s=estimate.light_s,
                 lights=estimate.lights,
@@ -81,8 +88,8 @@ class TrackSteps(TrackSights):
             estimate.steps.append(
                 Step(
                     t_s=t_s,
-                    before=before,
-                    after=estimate.state,
+                    before=before.to_row(),
+                    after=estimate.state.to_row(),
                     covariance=estimate.covariance,
                     F=moved[0],
                     Q=moved[1],
@@ -122,20 +129,26 @@ class TrackSteps(TrackSights):
         return times_s[: self._together + 1]
 
     def _take_depth(self, estimate: Estimate, t_s: float) -> None:
+        told = self._depth_of(estimate, t_s)
+        if told is None:
+            return
+        y, H, noise = told
+        if y[0] ** 2 < DEPTH_GATE * (float((H @ estimate.covariance @ H.T)[0, 0]) + noise):
+            self._apply(estimate, H, y, np.array([[noise]]))
+
+    def _depth_of(self, estimate: Estimate, t_s: float) -> tuple[Floats, Floats, float] | None:
+        """Give y (1,), H (1, SIZE) and the variance of both gauges' newest depths; None if they were taken before."""
         of_a, of_b = (newest_before(of_node, t_s) for of_node in self.depths)
         if of_a is None or of_b is None:
-            return
+            return None
         (time_a, a), (time_b, b) = of_a, of_b
         time_s = max(time_a, time_b)
         if min(time_a, time_b) <= estimate.depth_s or t_s - time_s > 0.3 or abs(time_a - time_b) > 0.2:
-            return
+            return None
         estimate.depth_s = time_s
         y, H = anchors.depth_residual(estimate.state, b.depth_m - a.depth_m, t_s - 0.5 * (time_a + time_b), self._ports)
         # Between the two messages a diver may rise or sink, by some 0.3 m/s.
-        noise = a.sigma_m**2 + b.sigma_m**2 + (0.3 * (time_a - time_b)) ** 2 + 1e-6
-        variance = float((H @ estimate.covariance @ H.T)[0, 0]) + noise
-        if y[0] ** 2 < 16.0 * variance:
-            self._apply(estimate, H, y, np.array([[noise]]))
+        return y, H, a.sigma_m**2 + b.sigma_m**2 + (0.3 * (time_a - time_b)) ** 2 + 1e-6
 
     def _take_attitude(self, estimate: Estimate, t_s: float) -> None:
         for node in (0, 1):
@@ -175,6 +188,6 @@ class TrackSteps(TrackSights):
     def _open(self, estimate: Estimate) -> None:
         if self._keep_s:
             still = np.eye(SIZE)[:MOVING], np.zeros((MOVING, MOVING)), np.zeros(SIZE - MOVING)
-            state, rates = estimate.state, estimate.rates_radps
-            first = Step(estimate.t_s, state, state, estimate.covariance, *still, rates, estimate.light_s, 0)
+            row, rates = estimate.state.to_row(), estimate.rates_radps
+            first = Step(estimate.t_s, row, row, estimate.covariance, *still, rates, estimate.light_s, 0)
             estimate.steps.append(first)

@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
-from buddyline.solver_service.track.state import MOVING, ROW, SIZE, State
+from buddyline.solver_service.track.state import MOVING, SIZE
 from numpy.typing import NDArray
 
 Chosen: TypeAlias = tuple[tuple[int, int, float], ...]
@@ -30,13 +30,14 @@ class Look:
 class Step:
     """One step of a track as the smoother needs it.
 
-    before: predicted; after, covariance: with what was seen at t_s. F (MOVING, SIZE), Q (MOVING, MOVING), walk: how it
-    came here from the step before. rates_radps (2, 3). lights: how many the last trigger's pictures told.
+    before: predicted; after, covariance: with what was seen at t_s. Both are a state's row (ROW,), or the error (SIZE,)
+    against the path that a pass is linear about. F (MOVING, SIZE), Q (MOVING, MOVING), walk: how it came here from the
+    step before. rates_radps (2, 3). lights: how many the last trigger's pictures told.
     """
 
     t_s: float
-    before: State
-    after: State
+    before: Floats
+    after: Floats
     covariance: Floats
     F: Floats
     Q: Floats
@@ -51,7 +52,7 @@ class Step:
 PACK = 128
 _UPPER, _MOVING_UPPER = np.triu_indices(SIZE), np.triu_indices(MOVING)
 _HALVES = (len(_UPPER[0]),), (len(_MOVING_UPPER[0]),)
-_SHAPES = ((), (), (), (2, 3), (ROW,), (ROW,), *_HALVES, (MOVING, SIZE), (SIZE - MOVING,))
+_SHAPES = ((), (), (), (2, 3), *_HALVES, (MOVING, SIZE), (SIZE - MOVING,))
 _ENDS = np.cumsum([math.prod(shape) for shape in _SHAPES]).tolist()
 _PARTS = list(zip([0, *_ENDS], _ENDS, _SHAPES, strict=False))
 
@@ -83,21 +84,19 @@ def _packed(steps: list[Step]) -> _Pack:
 
 def _row_of(step: Step) -> Floats:
     numbers = np.array((step.t_s, step.light_s, step.lights))
-    states = step.before.to_row(), step.after.to_row()
     halves = step.covariance[_UPPER], step.Q[_MOVING_UPPER]
-    return np.concatenate((numbers, step.rates_radps.ravel(), *states, *halves, step.F.ravel(), step.walk))
+    matrices = step.rates_radps.ravel(), *halves, step.F.ravel()
+    return np.concatenate((numbers, *matrices, step.walk, step.before, step.after))
 
 
 def _step_of(row: Floats, looks: tuple[Look, ...]) -> Step:
-    t_s, light_s, lights, rates, before, after, half, of_Q, F, walk = (
-        row[start:end].reshape(shape) for start, end, shape in _PARTS
-    )
+    t_s, light_s, lights, rates, half, of_Q, F, walk = (row[start:end].reshape(shape) for start, end, shape in _PARTS)
     covariance = np.empty((SIZE, SIZE))
     covariance[_UPPER] = covariance.T[_UPPER] = half
     Q = np.empty((MOVING, MOVING))
     Q[_MOVING_UPPER] = Q.T[_MOVING_UPPER] = of_Q
-    states = State.of_row(before), State.of_row(after)
-    return Step(float(t_s), *states, covariance, F, Q, walk, rates, float(light_s), int(lights), looks)
+    before, after = row[_ENDS[-1] :].reshape(2, -1)
+    return Step(float(t_s), before, after, covariance, F, Q, walk, rates, float(light_s), int(lights), looks)
 
 
 class Trail:

@@ -38,7 +38,10 @@ def test_tracks_that_disagree_on_the_clocks_are_in_pieces(
         # A false start, and the rest of the dive: no other offset of the clocks is worth a try.
         ([(0.0, 1.3, 0.02), (1.2, 60.0, 0.001)], True),
         ([(0.0, 1.3, 0.0), (1.2, 60.0, 0.05)], False),
-        ([(0.0, 15.0, 0.0), (15.0, 60.0, 0.0)], False),
+        # Two logs of a node, with a pause between them, or a track that was lost once: both agree on the clocks.
+        ([(0.0, 15.0, 0.0), (45.0, 60.0, 0.0)], True),
+        ([(0.0, 15.0, 0.0), (15.0, 60.0, 0.02)], False),
+        ([(0.0, 4.0, 0.0), (56.0, 60.0, 0.0)], False),
     ],
 )
 def test_a_track_of_nearly_all_of_a_dive_goes_on(

@@ -9,18 +9,20 @@ from buddyline.solver_service.track.dive import smooth
 from buddyline.solver_service.track.lights import COLUMNS, Sight
 from buddyline.solver_service.track.parts import parts_of
 from buddyline.solver_service.track.records import feed, pass_over
-from buddyline.solver_service.track.relax import PathFilter
+from buddyline.solver_service.track.relax import Known, PathPass
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.smoother import Path, smoothed
 from buddyline.solver_service.track.state import NAV, PHI, R_, SIZE
+from buddyline.solver_service.track.walking import Walking
 
 from tests.solver_service.track.assignments import weigh
-from tests.solver_service.track.dives import KnownDive, Setting, filter_of, make, score
+from tests.solver_service.track.dives import EPOCH_NS, KnownDive, Setting, filter_of, make, score
 
 
 def passed_about(dive: KnownDive, path: Path) -> Path:
-    a, b = dive.records
-    track = PathFilter((a.node, b.node), path, np.full((2, 2), 0.9), Shaking())
+    epoch_ns = EPOCH_NS - EPOCH_NS % 86_400_000_000_000
+    known = Known(dive.records, epoch_ns, 0, np.zeros((2, 2)), Walking())
+    track = PathPass(known, path, np.full((2, 2), 0.9), Shaking())
     pass_over(track, dive.records, ())
     return smoothed(track.passed.steps, path)
 
@@ -69,7 +71,8 @@ def test_pictures_are_weighed_together_by_all_the_dive_but_themselves() -> None:
     counts = set()
     for node in (0, 1):
         seen = [(guide, sights[key]) for key, guide in again.guides.items() if key[0] == node]
-        for (guide, sight), odds in zip(seen, again._odds_by(path, seen), strict=True):
+        for (guide, sight), by_path in zip(seen, again._by_path(path, seen), strict=True):
+            odds = by_path.odds
             k, after_s = guide.step, guide.look.t_s - float(path.t_s[guide.step])
             _, y, H = again._compared(sight, path.state(k), path.rates_radps[k], after_s)
             information, told = np.linalg.inv(path.covariance(k)), np.zeros(len(COLUMNS))

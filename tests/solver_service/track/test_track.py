@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,13 +10,15 @@ import pytest
 from buddyline.node.imu_means import ImuPacker
 from buddyline.protocol.messages import Imu
 from buddyline.solver_service.track import dive as dive_track
+from buddyline.solver_service.track import relax
 from buddyline.solver_service.track.dive import smooth
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.lag import TrackLag
 from buddyline.solver_service.track.output import TrackRow
-from buddyline.solver_service.track.records import NodeRecord, Records, last_ns, pass_over
-from buddyline.solver_service.track.smoother import Path
+from buddyline.solver_service.track.records import NodeRecord, last_ns
+from buddyline.solver_service.track.smoother import Path, smoothed
+from buddyline.solver_service.track.trail import Trail
 
 from tests.solver_service.track.assignments import weigh
 from tests.solver_service.track.dives import EPOCH_NS, KnownDive, Setting, filter_of, fix_errors, make, score
@@ -192,19 +193,19 @@ def test_seconds_of_darkness(dark_s: float, worst_m: float) -> None:
     assert judged.errors_m.max() < worst_m
 
 
-def test_a_second_pass_that_diverges_is_no_track(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_passes_that_diverge_are_no_track(monkeypatch: pytest.MonkeyPatch) -> None:
     short = make(4, replace(SHORT, seconds=6.0))
 
-    def diverging(track: TrackFilter, records: Records, fixes: Sequence[FixSeen], **limits_ns: int) -> None:
-        pass_over(track, records, fixes, **limits_ns)
-        if not track.restarts and track.main is not None:
-            track.main.state = replace(track.main.state, clock_s=-0.7)
+    def diverging(steps: Trail, about: Path) -> Path:
+        """Its clocks are 0.7 s apart."""
+        path = smoothed(steps, about)
+        return replace(path, states=np.array([replace(path.state(k), clock_s=-0.7).to_row() for k in range(len(path))]))
 
     assert list(smooth(short.records, short.fixes, short.stamps_ns).rows)
-    monkeypatch.setattr(dive_track, "pass_over", diverging)
+    monkeypatch.setattr(relax, "smoothed", diverging)
     found = smooth(short.records, short.fixes, short.stamps_ns)
     assert not list(found.rows)
-    assert "it has diverged: no track" in found.problems[-1]
+    assert "contradict the first one" in found.problems[-1]
 
 
 def test_a_beginning_that_is_carried_back_wrong_does_not_lead_the_second_pass_astray(
