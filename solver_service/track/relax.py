@@ -52,10 +52,10 @@ from buddyline.solver_service.track.walking import Walking
 
 # What is believed of the place at first, 1 sd, as a share of the range.
 BROAD_SHARE: Final = 0.5
-# A dive is passed over so often at most, until a pass moves no pose by so many sigmas: the next one then moves them by
-# a fifth of that or less. Tracks that began with single lamps, or late, settle more slowly, and may settle at a wrong
-# one: there is a track where chi^2 of each residual is below UNFIT, on average, and the last pass takes LEAST_TOLD of
-# the lights of the first.
+# A dive is passed over so often at most, until a pass moves no pose by so many sigmas: the next one would move none by
+# much more than a tenth of that. Tracks that began with single lamps, or late, settle more slowly, and may settle at a
+# wrong one: there is a track where chi^2 of each residual is below UNFIT, on average, and the last pass takes
+# LEAST_TOLD of the lights of the first.
 PASSES: Final = 12
 STAYS_SIGMAS: Final = 1.0
 DOUBTFUL_SIGMAS: Final = 0.3
