@@ -38,7 +38,7 @@ from buddyline.solver_service.track.records import (
     pass_over,
     stamp_of,
 )
-from buddyline.solver_service.track.relax import Known, PathPass, settled
+from buddyline.solver_service.track.relax import PassedOver, PathPass, settled
 from buddyline.solver_service.track.smoother import Path, rows_between, smoothed
 from buddyline.solver_service.track.start import CLOCK_S
 from buddyline.solver_service.track.state import NAV
@@ -106,7 +106,7 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
         pass_over(only, records, fixes)
         return replace(_smoothed(only, parts_of(only), outputs_ns), clock_sigma_s=math.inf)
     shares = reduce(Shares.plus, [part.shares for part in parts]).best()
-    known = Known(records, first.epoch_ns or 0, clock_ns, shares, Walking())
+    known = PassedOver(records, first.epoch_ns or 0, clock_ns, shares, Walking())
     if all(part.lone for part in parts):
         return _of_one_lamp_each(known, max(parts, key=lasted_s), outputs_ns)
     # Beside a track of any other start these are not linear enough for the passes below.
@@ -147,7 +147,7 @@ def _contradicts(path: Path, first: Estimate, limit_s: float) -> bool:
     return abs(path.state(-1).clock_s - first.state.clock_s) >= max(limit_s, TOLD_SIGMAS * sigma_s)
 
 
-def _of_one_lamp_each(known: Known, part: Estimate, outputs_ns: Sequence[int]) -> Smoothed:
+def _of_one_lamp_each(known: PassedOver, part: Estimate, outputs_ns: Sequence[int]) -> Smoothed:
     """Give the track that began with one lamp of each node, the dive's beginning with it if that settles, too."""
     path, told, shaking = smoothed(part.steps), sum(part.told_by), part.shaking.less(known.shares)
     part.steps = Trail()
@@ -163,7 +163,7 @@ def _of_one_lamp_each(known: Known, part: Estimate, outputs_ns: Sequence[int]) -
     return _rows_of([track], [path], outputs_ns)
 
 
-def _path_before(known: Known, path: Path, since_s: float) -> Path | None:
+def _path_before(known: PassedOver, path: Path, since_s: float) -> Path | None:
     """Give the path before another's start, from since_s or the dive's first picture on; None where there is none."""
     records, clock_ns = known.records, known.clock_ns
     track = EarlierFilter(records[0].node, records[1].node, keep_s=math.inf, clock_sigma_s=CLOCK_S)

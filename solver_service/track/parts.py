@@ -39,12 +39,14 @@ def parts_of(track: TrackFilter) -> list[Estimate]:
 def goes_on(parts: Sequence[Estimate]) -> bool:
     """Whether tracks of one settled offset of the clocks are nearly all of a dive's tracks; others are false starts.
 
-    With a wrong offset tracks are replaced after seconds, or go on but ask for another offset in each pass.
+    With a wrong offset tracks are replaced after seconds, or go on but ask for another offset in each pass. Beside a
+    track of single lamps, one of another start is a false one, and the other way round.
     """
     if len(parts) < 2:
         return True
     longest = max(parts, key=lasted_s)
-    settled = [part for part in parts if not disagree(longest, part, NEAR_CLOCK_S) and not clock_left_ns([part])]
+    alike = [part for part in parts if part.lone == longest.lone]
+    settled = [part for part in alike if not disagree(longest, part, NEAR_CLOCK_S) and not clock_left_ns([part])]
     together_s, all_s = (sum(map(lasted_s, some)) for some in (settled, parts))
     whole_s = max(part.t_s for part in parts) - min(part.start_s for part in parts)
     return together_s > NEARLY_ALL * (all_s if together_s > LONG_S else whole_s) and longest in settled

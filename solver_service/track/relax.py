@@ -67,7 +67,7 @@ LEAST_TOLD: Final = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class PassedOver:
     """What a first pass has told of a dive, beside its path.
 
     epoch_ns: of the path's times. clock_ns: how far B's clock is believed ahead. shares (2, 2): as `take_off` takes
@@ -83,7 +83,7 @@ class Known:
 
 
 @dataclass(frozen=True, eq=False)
-class _Told:
+class _ToldStep:
     """A step that samples tell, about a path.
 
     F (MOVING, SIZE), walk (SIZE - MOVING,), rates_radps (2, 3): how it goes on; missed (SIZE,): by what error it misses
@@ -106,7 +106,7 @@ class PathPass(TrackSteps):
     detection (2, 2): how likely each light is found. passed: the estimate, to be smoothed about the same path.
     """
 
-    def __init__(self, known: Known, path: Path, detection: Floats, shaking: Shaking) -> None:
+    def __init__(self, known: PassedOver, path: Path, detection: Floats, shaking: Shaking) -> None:
         super().__init__((known.records[0].node, known.records[1].node), keep_s=math.inf)
         self.epoch_ns, self.clock_ns, self.unrest = known.epoch_ns, known.clock_ns, known.unrest
         self.take_off(known.shares)
@@ -177,7 +177,7 @@ class PathPass(TrackSteps):
             steps.append(self._seen(step, by_step.get(self._k, ())))
             steps.pack()
 
-    def _told_to(self, last: int) -> dict[int, _Told]:
+    def _told_to(self, last: int) -> dict[int, _ToldStep]:
         """Work out the steps to the path's last one, where samples tell them, by the step that each starts from."""
         path, first, main = self._path, self._k, self.passed
         if last == first:
@@ -202,9 +202,9 @@ class PathPass(TrackSteps):
         lost = np.array([self._with_sudden(np.zeros(3), turn) for turn in sudden_rad]) / variances
         self._shaking = variances
         rows = zip(F, Q, walk, shaken, parts.rate_radps, missed, lost, strict=True)
-        return {k: _Told(*row) for k, row in zip(at.tolist(), rows, strict=True)}
+        return {k: _ToldStep(*row) for k, row in zip(at.tolist(), rows, strict=True)}
 
-    def _next(self, told: _Told | None) -> Step:
+    def _next(self, told: _ToldStep | None) -> Step:
         """Go to the path's next step: its state there, and how far off that what is filtered is."""
         main, path = self.passed, self._path
         self._k += 1
@@ -287,7 +287,7 @@ class PathPass(TrackSteps):
 
 
 def settled(
-    path: Path, detection: Floats, shaking: Shaking, known: Known, told: int, *, doubtful: bool
+    path: Path, detection: Floats, shaking: Shaking, known: PassedOver, told: int, *, doubtful: bool
 ) -> tuple[PathPass, Path] | None:
     """Pass over a dive about the last pass's path until that does not move; None where it does not settle.
 

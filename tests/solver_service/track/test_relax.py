@@ -9,7 +9,7 @@ from buddyline.solver_service.track.dive import smooth
 from buddyline.solver_service.track.lights import COLUMNS, Sight
 from buddyline.solver_service.track.parts import parts_of
 from buddyline.solver_service.track.records import feed, pass_over
-from buddyline.solver_service.track.relax import Known, PathPass
+from buddyline.solver_service.track.relax import PassedOver, PathPass
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.smoother import Path, smoothed
 from buddyline.solver_service.track.state import NAV, PHI, R_, SIZE
@@ -21,7 +21,7 @@ from tests.solver_service.track.dives import EPOCH_NS, KnownDive, Setting, filte
 
 def passed_about(dive: KnownDive, path: Path) -> Path:
     epoch_ns = EPOCH_NS - EPOCH_NS % 86_400_000_000_000
-    known = Known(dive.records, epoch_ns, 0, np.zeros((2, 2)), Walking())
+    known = PassedOver(dive.records, epoch_ns, 0, np.zeros((2, 2)), Walking())
     track = PathPass(known, path, np.full((2, 2), 0.9), Shaking())
     pass_over(track, dive.records, ())
     return smoothed(track.passed.steps, path)
