@@ -14,8 +14,8 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Message, NodeInfo, NodePose, Rejected, RelativePose, TrackMode
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
 from buddyline.solver_service.network.belief import KnownPlace
-from buddyline.solver_service.network.estimate import NetRow
 from buddyline.solver_service.network.filter import NetFilter
+from buddyline.solver_service.network.rows import NetRow
 from buddyline.solver_service.pace import NO_NETWORK
 from buddyline.solver_service.results import NUMERIC_ERRORS, view_of
 from buddyline.solver_service.streams import STOPPED_NS, NodeStream

@@ -32,15 +32,15 @@ from buddyline.solver_service.config import SolveConfig, track_settings
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, rotation_log
 from buddyline.solver_service.network import shaking, state
-from buddyline.solver_service.network.estimate import NetEstimate, NetRow
-from buddyline.solver_service.network.state import NetState, block
+from buddyline.solver_service.network.estimate import NetEstimate
+from buddyline.solver_service.network.rows import DueNetRow, plain_of_posed
+from buddyline.solver_service.network.state import POSED, NetState, block
 from buddyline.solver_service.network.trail import Told
 from buddyline.solver_service.tracking import PairTracker
 
 START_NS = 1_764_000_000_000_000_000
 # Beyond these a row is wrong, as `evaluate` has it.
 WRONG_M, WRONG_RAD = 0.3, 0.1
-POSED = 9
 FOUR = {"more_nodes": ("c", "d"), "fixed_nodes": ("a",)}
 # Nodes a and c stand, and b moves to 6 m away.
 BASIN = {"more_nodes": ("c",), "fixed_nodes": ("a", "c"), "environment": "basin", "range_max_m": 6.0}
@@ -127,17 +127,17 @@ def solved(messages: Sequence[Message], mode: str, hz: float) -> NetRun:
     def note(stamp_ns: int, nodes: list[int], at: NetState, P: Floats) -> None:
         J = np.zeros((3 * len(at), POSED * len(at)))
         for i in range(len(at)):
-            J[3 * i : 3 * i + 3, POSED * i : POSED * (i + 1)] = NetEstimate.plain(at, i)[:3]
+            J[3 * i : 3 * i + 3, POSED * i : POSED * (i + 1)] = plain_of_posed(at.p_m[i], at.v_mps[i])[:3]
         joint[stamp_ns] = nodes, J @ P @ J.T
 
     def posed(at: NetState) -> list[int]:
         return [index for i in range(len(at)) for index in range(block(i).start, block(i).start + POSED)]
 
-    filtered, smoothed = NetEstimate.rows, Told.smoothed
+    noted, smoothed = NetEstimate.due_row, Told.smoothed
 
-    def rows(self: NetEstimate, t_s: float, stamp_ns: int) -> list[NetRow]:
-        found = filtered(self, t_s, stamp_ns)
-        if found and self.state is not None:
+    def due_row(self: NetEstimate, t_s: float, stamp_ns: int) -> DueNetRow | None:
+        found = noted(self, t_s, stamp_ns)
+        if found is not None and self.state is not None:
             after, move, *_ = self._moved(t_s) if t_s - self.t_s > 1e-6 else (self.state, None)
             P = self.covariance if move is None else move.covariance(self.covariance)
             note(stamp_ns, [one.node for one in self.members], after, P[np.ix_(posed(after), posed(after))])
@@ -151,7 +151,7 @@ def solved(messages: Sequence[Message], mode: str, hz: float) -> NetRun:
 
     silent = {"take": lambda *_: [], "finish": lambda *_: []}
     with (
-        patch.object(NetEstimate, "rows", rows),
+        patch.object(NetEstimate, "due_row", due_row),
         patch.object(Told, "smoothed", back),
         patch.multiple(PairTracker, **silent),
     ):

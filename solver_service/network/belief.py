@@ -9,7 +9,8 @@ from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log, skew
-from buddyline.solver_service.network.motion import Move, moved_member
+from buddyline.solver_service.network.motion import Move, moved_members
+from buddyline.solver_service.network.rows import NetWay, plain_of_posed
 from buddyline.solver_service.network.shaking import NetShaking
 from buddyline.solver_service.network.state import (
     BLOCK,
@@ -21,6 +22,7 @@ from buddyline.solver_service.network.state import (
     MOVING,
     P_,
     PHI,
+    POSED,
     SHAKE,
     SHOVE,
     V_,
@@ -33,7 +35,7 @@ from buddyline.solver_service.network.trail import Chosen, Grown, Learned, NetTr
 from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.inputs import AttitudeSeen, TrackNode
 from buddyline.solver_service.track.intake import TrackIntake, newest_before
-from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S, WITHOUT_RAD, WITHOUT_RADPS, increments
+from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S, WITHOUT_RAD, WITHOUT_RADPS, excerpt, increments
 from buddyline.solver_service.track.stepping import ATTITUDE_EVERY_S, TICK_S
 from buddyline.solver_service.track.strapdown import Noise
 
@@ -198,39 +200,51 @@ class NetBelief:
         stated = self.intake.turning[node].stated(t_s)
         return noise if stated is None else replace(noise, gap_tilt_rad=stated[0], gap_heading_rad=stated[1])
 
+    @property
+    def _moving(self) -> list[int]:
+        """The members that are not fixed."""
+        return [i for i, member in enumerate(self.members) if member.node not in self.places]
+
     def _moved(self, to_s: float) -> tuple[NetState, Move, Floats, list[bool], Floats]:
         """Give the state at to_s, the step to it, turn rates, who is without inertial unit, and what shaking adds."""
         assert self.state is not None
-        state, n = self.state, len(self.state)
+        state, moving, n = self.state, self._moving, len(self.state)
         F, Q = np.tile(np.eye(BLOCK), (n, 1, 1)), np.zeros((n, BLOCK, BLOCK))
-        names = ("p_m", "v_mps", "R", "shake_rad", "shove_mps")
-        fields = {name: getattr(state, name).copy() for name in names}
         rates, without = np.zeros((n, 3)), [False] * n
-        shaking = self.shaking.variances
         drawn = np.zeros((n, 2, MOVING, MOVING))
-        moving = [i for i, member in enumerate(self.members) if member.node not in self.places]
         if moving:
-            samples = [self.intake.samples[self.members[i].node] for i in moving]
-            parts = increments(samples, state if len(moving) == n else state.chosen(moving), self.t_s, to_s)
-        for part, i in enumerate(moving):
-            member = self.members[i]
-            noise = self._noise_of(member.node, to_s)
-            after, F[i], Q[i], drawn[i] = moved_member(state, i, parts, part, noise, shaking[i], to_s - self.t_s)
-            without[i] = bool(parts.without[part])
-            if without[i] != member.without:
-                # The unit has stopped, or come back: these errors now stand for something else, and are unknown.
-                Q[i, GYRO_BIAS, GYRO_BIAS] += WITHOUT_RADPS**2 * np.eye(3)
-                Q[i, MOUNT, MOUNT] += WITHOUT_RAD**2 * np.eye(3)
-            rates[i] = parts.rate_radps[part]
-            for name in names:
-                fields[name][i] = after[name]
-        move = Move(F, Q)
-        if self.anchor is not None:
-            p, v = fields["p_m"][self.anchor].copy(), fields["v_mps"][self.anchor].copy()
-            move = Move(F, Q, self.anchor, p, v)
-            fields["p_m"] -= p
-            fields["v_mps"] -= v
-        return replace(state, **fields), move, rates, without, drawn
+            nodes = [self.members[i].node for i in moving]
+            of_moving = state if len(moving) == n else state.chosen(moving)
+            parts = increments([self.intake.samples[node] for node in nodes], of_moving, self.t_s, to_s)
+            noises = [self._noise_of(node, to_s) for node in nodes]
+            shaking = self.shaking.variances[moving]
+            after, *step = moved_members(of_moving, parts, noises, shaking, to_s - self.t_s)
+            F[moving], Q[moving], drawn[moving] = step
+            rates[moving] = parts.rate_radps
+            state = after if len(moving) == n else state.replaced(moving, after)
+            for i, now in zip(moving, parts.without.tolist(), strict=True):
+                without[i] = now
+                if now != self.members[i].without:
+                    # The unit has stopped, or come back: these errors now stand for something else, and are unknown.
+                    Q[i, GYRO_BIAS, GYRO_BIAS] += WITHOUT_RADPS**2 * np.eye(3)
+                    Q[i, MOUNT, MOUNT] += WITHOUT_RAD**2 * np.eye(3)
+        if self.anchor is None:
+            return state, Move(F, Q), rates, without, drawn
+        p, v = state.p_m[self.anchor], state.v_mps[self.anchor]
+        state = replace(state, p_m=state.p_m - p, v_mps=state.v_mps - v)
+        return state, Move(F, Q, self.anchor, p, v), rates, without, drawn
+
+    def _way(self, to_s: float) -> NetWay:
+        """Give what leads to the state at to_s, without going there."""
+        assert self.state is not None
+        moving = self._moving
+        nodes, delays_s = [self.members[i].node for i in moving], self.state.delay_s[moving].tolist()
+        samples = [
+            excerpt(self.intake.samples[node], delay_s, self.t_s, to_s)
+            for node, delay_s in zip(nodes, delays_s, strict=True)
+        ]
+        noises = [self._noise_of(node, to_s) for node in nodes]
+        return NetWay(to_s - self.t_s, moving, samples, noises, self.shaking.variances[moving])
 
     def step(self, t_s: float) -> None:
         """Bring the network to t_s, by ticks where that is long, and take what sensors say there."""
@@ -338,13 +352,6 @@ class NetBelief:
     def sigma_m(self, index: int) -> float:
         """Give how well a member's place is known, 1 sd of its distance."""
         assert self.state is not None
-        J = self.plain(self.state, index)
-        own = self.covariance[block(index), block(index)][:9, :9]
-        return math.sqrt(max(float(np.trace((J @ own @ J.T)[:3, :3])), 0.0))
-
-    @staticmethod
-    def plain(state: NetState, index: int) -> Floats:
-        """Give (9, 9): plain errors of place, velocity and attitude by a member's own."""
-        J = np.eye(9)
-        J[P_, PHI], J[V_, PHI] = -skew(np.stack((state.p_m[index], state.v_mps[index])))
-        return J
+        J = plain_of_posed(self.state.p_m[index], self.state.v_mps[index])[P_]
+        own = self.covariance[block(index), block(index)][:POSED, :POSED]
+        return math.sqrt(max(float(np.trace(J @ own @ J.T)), 0.0))

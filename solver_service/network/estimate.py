@@ -14,8 +14,9 @@ from buddyline.protocol.messages import Blink
 from buddyline.solver_service.geometry.rotation import Floats, rotation_log, skew
 from buddyline.solver_service.network.belief import Member, NetBelief
 from buddyline.solver_service.network.exclusive import share
+from buddyline.solver_service.network.rows import DueNetRow, NetRow, rows_of
 from buddyline.solver_service.network.sights import columns, light_positions
-from buddyline.solver_service.network.state import BLOCK, P_, PHI, V_, NetState, block, lone
+from buddyline.solver_service.network.state import BLOCK, P_, PHI, V_, block, lone
 from buddyline.solver_service.network.trail import Present, Told
 from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.association import odds_of
@@ -34,10 +35,7 @@ GIVEN_UP: Final = -15.0
 PATIENCE_S: Final = 4.0
 # Beyond this chi^2 a pose (6 degrees of freedom) or an attitude (3) contradicts the network.
 CONTRADICTS: Final = 33.0
-# A node's pose is given while its position is better than TOLD_M, 1 sd, or than a share of its distance from the
-# frame's zero. A node leaves after LOST_S without a light when its position is worse than LOST_M.
-TOLD_M: Final = 0.5
-TOLD_SHARE: Final = 0.1
+# A node leaves after LOST_S without a light when its position is worse than LOST_M.
 LOST_S: Final = 3.0
 LOST_M: Final = 1.5
 # A bar whose lights are further outside of a picture than this is not looked for in it.
@@ -56,19 +54,6 @@ class PairFix(FixSeen):
 
     node: int = 0
     other: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class NetRow:
-    """One node's pose in the net's frame at one time, as the message NodePose has it."""
-
-    node: int
-    stamp_ns: int
-    p_m: Floats
-    R: Floats
-    v_mps: Floats
-    covariance: Floats
-    age_s: float
 
 
 class NetEstimate(NetBelief):
@@ -266,16 +251,12 @@ class NetEstimate(NetBelief):
 
     # Rows
 
-    def rows(self, t_s: float, stamp_ns: int) -> list[NetRow]:
-        """Give the confirmed members at a time at or after the last picture's."""
+    def due_row(self, t_s: float, stamp_ns: int) -> DueNetRow | None:
+        """Note what the confirmed members' row is made of, at a time at or after the last picture's; None before it."""
         if self.state is None or not self._ticks_to(t_s):
-            return []
-        state, P = self.state, self.covariance
-        if t_s - self.t_s > 1e-6:
-            state, move, *_ = self._moved(t_s)
-            P = move.covariance(P)
-        own = np.stack([P[block(index), block(index)][:9, :9] for index in range(len(self.members))])
-        return self._rows_of(stamp_ns, self._present(t_s), state, own)
+            return None
+        way = self._way(t_s) if t_s - self.t_s > 1e-6 else None
+        return DueNetRow(stamp_ns, self._present(t_s), self.state, self.covariance, way, self.anchor)
 
     def ask(self, t_s: float, stamp_ns: int) -> None:
         """Note that `smoothed` is to give a row of a time at or after the last picture's, and go on to there."""
@@ -304,7 +285,7 @@ class NetEstimate(NetBelief):
             sure |= {(one.node, one.since_s) for one in told.members if one.confirmed}
             if since_s < told.t_s <= until_s:
                 present = [replace(one, confirmed=(one.node, one.since_s) in sure) for one in told.members]
-                rows.append(self._rows_of(told.stamp_ns, present, state, own))
+                rows.append(rows_of([told.stamp_ns] * len(present), present, state, own))
         return [row for of_time in reversed(rows) for row in of_time]
 
     def _present(self, t_s: float) -> list[Present]:
@@ -312,28 +293,3 @@ class NetEstimate(NetBelief):
             Present(one.node, one.since_s, one.confirmed, max(t_s - max(one.light_s, one.since_s), 0.0))
             for one in self.members
         ]
-
-    def _rows_of(self, stamp_ns: int, members: Sequence[Present], state: NetState, own: Floats) -> list[NetRow]:
-        """Give the confirmed members whose places are known well; own (n, 9, 9): covariances in the state's errors."""
-        rows = []
-        for index, member in enumerate(members):
-            if not member.confirmed:
-                continue
-            J = self.plain(state, index)
-            plain = J @ own[index] @ J.T
-            told_m = max(TOLD_M, TOLD_SHARE * float(np.linalg.norm(state.p_m[index])))
-            if not math.sqrt(max(float(np.trace(plain[:3, :3])), 0.0)) < told_m:
-                continue
-            which = np.r_[P_, PHI]
-            rows.append(
-                NetRow(
-                    node=member.node,
-                    stamp_ns=stamp_ns,
-                    p_m=state.p_m[index],
-                    R=state.R[index],
-                    v_mps=state.v_mps[index],
-                    covariance=plain[np.ix_(which, which)],
-                    age_s=member.age_s,
-                )
-            )
-        return rows

@@ -16,8 +16,9 @@ import numpy as np
 from buddyline.protocol.messages import Blink
 from buddyline.solver_service.geometry.rotation import rotation_log, skew
 from buddyline.solver_service.network.belief import KnownPlace
-from buddyline.solver_service.network.estimate import CONTRADICTS, NetEstimate, NetRow, PairFix
+from buddyline.solver_service.network.estimate import CONTRADICTS, NetEstimate, PairFix
 from buddyline.solver_service.network.fixed import FixedWatch
+from buddyline.solver_service.network.rows import DueNetRow, NetRow, make_rows
 from buddyline.solver_service.network.trail import NetTrail
 from buddyline.solver_service.track.inputs import FixSeen, TrackNode
 from buddyline.solver_service.track.intake import CHECK_EVERY_S, TrackIntake, newest_before
@@ -126,16 +127,20 @@ class NetFilter(TrackIntake):
         if self._rehearses:
             self._rehearse()
         rows: list[NetRow] = []
+        due: list[DueNetRow] = []
         while self._events and self._events[0][0] <= end_s:
             t_s, _, _, what = heapq.heappop(self._events)
-            if isinstance(what, int):
-                rows += self._rows(t_s, what)
+            if isinstance(what, int) and self.smooths:
+                rows += self._ask(t_s, what)
+            elif isinstance(what, int):
+                row = self.main.due_row(t_s, what)
+                due += [row] if row is not None else []
             elif isinstance(what, PairFix):
                 self._take_fix(t_s, what)
             elif isinstance(what, Sight):
                 self._take_sight(t_s, what)
         self._forget_before(end_s - MEMORY_S)
-        return rows
+        return rows + make_rows(due)
 
     def finish(self) -> list[NetRow]:
         """Return the rows that have not been smoothed yet, at the end of the dive."""
@@ -166,9 +171,8 @@ class NetFilter(TrackIntake):
         trial._go_on(self._events[0][0] + REHEARSED_S)
         return trial.main
 
-    def _rows(self, t_s: float, stamp_ns: int) -> list[NetRow]:
-        if not self.smooths:
-            return self.main.rows(t_s, stamp_ns)
+    def _ask(self, t_s: float, stamp_ns: int) -> list[NetRow]:
+        """Note that a row is to be smoothed; return those that can be by now."""
         for estimate in [self.main, *self.challengers]:
             estimate.ask(t_s, stamp_ns)
         if self._smoothed_s == -np.inf:

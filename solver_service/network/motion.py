@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -34,7 +35,12 @@ _I: Final[Floats] = np.eye(3)
 # By how much the frame's zero may rise or sink in a step, where the frame moves with a node.
 DATUM_STEP_M: Final = 1.0
 # Where an increment's rows and columns stand in a member's transition.
-_INTO: Final = np.ix_(np.r_[PHI, V_, P_], np.r_[PHI, GYRO_BIAS, ACCEL_BIAS, MOUNT, LEVER, DELAY])
+_INTO: Final = (
+    slice(None),
+    np.r_[PHI, V_, P_][:, None],
+    np.r_[PHI, GYRO_BIAS, ACCEL_BIAS, MOUNT, LEVER, DELAY],
+)
+_CONSTANTS: Final = np.arange(MOVING, BLOCK)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,60 +105,84 @@ class Move:
         return symmetric
 
 
-def moved_member(
-    state: NetState, member: int, parts: Increments, part: int, noise: Noise, shaking: Floats, span_s: float
-) -> tuple[dict[str, Floats], Floats, Floats, Floats]:
-    """Give a member's fields after a step, its F (BLOCK, BLOCK) and Q (BLOCK, BLOCK), and what of that is shaking.
+def moved_members(
+    state: NetState, parts: Increments, noises: Sequence[Noise], shaking: Floats, span_s: float | Floats
+) -> tuple[NetState, Floats, Floats, Floats]:
+    """Give members (n) after a step of span_s, or of (n,) each its own, their F and Q (n, BLOCK, BLOCK), and what of Q
+    is shaking (n, 2, MOVING, MOVING).
 
-    part: which of the parts is the member's. shaking (2,): variances of the unit's angle in its mount, and of the
-    velocity that shaking adds.
+    shaking (n, 2): variances of the unit's angle in its mount, and of the velocity that shaking adds.
     """
-    kept = kept_share(span_s)
-    felt = 0.0 if parts.without[part] else 1.0
-    gone, back_s = felt * (1.0 - kept), felt * (span_s - SHAKEN_S * (1.0 - kept))
-    p, v, R0 = state.p_m[member], state.v_mps[member], state.R[member]
-    shake, shove = felt * state.shake_rad[member], state.shove_mps[member]
-    R = rotation_exp(R0 @ shake) @ parts.R[part] @ rotation_exp(-kept * shake)
-    after = {
-        "p_m": p + span_s * v + back_s * shove + parts.dp_m[part] + 0.5 * span_s**2 * GRAVITY_MPS2,
-        "v_mps": v + gone * shove + parts.dv_mps[part] + span_s * GRAVITY_MPS2,
-        "R": R,
-        "shake_rad": kept * state.shake_rad[member],
-        "shove_mps": kept * shove,
-    }
-    F = np.eye(BLOCK)
-    F[:MOVING] = 0.0
-    F[_INTO] = parts.jacobian[part]
-    F[P_, P_] = F[V_, V_] = _I
-    F[P_, V_] = span_s * _I
-    F[P_, SHOVE] = back_s * _I
-    F[V_, SHOVE] = gone * _I
-    F[SHOVE, SHOVE] = F[SHAKE, SHAKE] = kept * _I
-    F[PHI, SHAKE] = felt * (R0 - kept * R)
-    F[:, :MOVING] = F[:, :MOVING] @ plain_of_own(p, v, shove)
-    T = np.eye(BLOCK)
-    T[:MOVING, :MOVING] = own_of_plain(after["p_m"], after["v_mps"], after["shove_mps"])
-    moving = T[:MOVING, :MOVING]
-    drawn = felt * shaking[:, None, None] * (moving @ shaking_parts(R, span_s) @ moving.T)
-    Q = T @ _noise(float(parts.gap_s[part]), noise, span_s, without=bool(parts.without[part])) @ T.T
-    Q[:MOVING, :MOVING] += drawn.sum(axis=0)
-    return after, T @ F, Q, drawn
+    span = np.broadcast_to(np.asarray(span_s), (len(state),))
+    h, kept = span[:, None], kept_share(span)[:, None]
+    # Without a unit nothing is shaken.
+    felt = (~parts.without).astype(np.float64)[:, None]
+    gone, back_s = felt * (1.0 - kept), felt * (h - SHAKEN_S * (1.0 - kept))
+    p, v, R0 = state.p_m, state.v_mps, state.R
+    shake, shove = felt * state.shake_rad, felt * state.shove_mps
+    off = rotation_exp((R0 @ shake[:, :, None])[:, :, 0])
+    R = off @ parts.R @ rotation_exp(-kept * shake)
+    after = replace(
+        state,
+        p_m=p + h * v + back_s * shove + parts.dp_m + 0.5 * h * h * GRAVITY_MPS2,
+        v_mps=v + gone * shove + parts.dv_mps + h * GRAVITY_MPS2,
+        R=R,
+        shake_rad=kept * state.shake_rad,
+        shove_mps=kept * shove,
+    )
+
+    def scaled(by: Floats) -> Floats:
+        return by[:, :, None] * _I
+
+    moved = np.zeros((len(state), MOVING, BLOCK))
+    moved[_INTO] = parts.jacobian
+    moved[:, P_, P_] = moved[:, V_, V_] = _I
+    moved[:, P_, V_], moved[:, P_, SHOVE], moved[:, V_, SHOVE] = scaled(h), scaled(back_s), scaled(gone)
+    moved[:, SHOVE, SHOVE] = moved[:, SHAKE, SHAKE] = scaled(kept)
+    moved[:, PHI, SHAKE] = felt[:, :, None] * (R0 - kept[:, :, None] * R)
+    moved[:, :, :MOVING] = moved[:, :, :MOVING] @ plain_of_own(p, v, shove)
+    own = own_of_plain(after.p_m, after.v_mps, after.shove_mps)
+    own_back = np.swapaxes(own, 1, 2)
+    F, Q = np.tile(np.eye(BLOCK), (len(state), 1, 1)), np.zeros((len(state), BLOCK, BLOCK))
+    F[:, :MOVING] = own @ moved
+    shaken = shaking[:, :, None, None] * shaking_parts(R, span)
+    drawn = felt[:, :, None, None] * (own[:, None] @ shaken @ own_back[:, None])
+    noise, walks = _noise(parts, noises, span)
+    Q[:, :MOVING, :MOVING] = own @ noise @ own_back + drawn.sum(axis=1)
+    Q[:, _CONSTANTS, _CONSTANTS] = walks
+    return after, F, Q, drawn
 
 
-def _noise(gap_s: float, noise: Noise, span_s: float, *, without: bool) -> Floats:
-    """Give what a step adds to a member's plain errors (BLOCK, BLOCK) but for shaking; as strapdown.process_noise."""
-    Q = np.zeros((BLOCK, BLOCK))
-    force = noise.accel_mps**2 * span_s + noise.gap_accel_mps**2 * gap_s
-    Q[V_, V_] = force * _I
-    Q[P_, V_] = Q[V_, P_] = 0.5 * span_s * force * _I
-    Q[P_, P_] = span_s * span_s / 3.0 * force * _I
-    if without:
-        Q[PHI, PHI] = noise.gap_rate_radps**2 * span_s**3 / 3.0 * _I
-        Q[GYRO_BIAS, GYRO_BIAS] = noise.gap_rate_radps**2 * span_s * _I
-        walks = np.array((noise.gap_tilt_rad, noise.gap_tilt_rad, noise.gap_heading_rad))
-        Q[MOUNT, MOUNT] = np.diag(walks**2 * span_s)
-    else:
-        Q[PHI, PHI] = (noise.gyro_rad**2 * span_s + noise.gap_gyro_rad**2 * gap_s) * _I
-        Q[GYRO_BIAS, GYRO_BIAS] = noise.gyro_bias_radps**2 * span_s * _I
-    Q[ACCEL_BIAS, ACCEL_BIAS] = noise.accel_bias_mps2**2 * span_s * _I
-    return Q
+def _noise(parts: Increments, noises: Sequence[Noise], span: Floats) -> tuple[Floats, Floats]:
+    """Give what a step adds to members' plain errors but for shaking, as strapdown.process_noise: a covariance (n,
+    MOVING, MOVING) of those that it moves, and variances (n, BLOCK - MOVING) of the constants."""
+    squared = np.square([_densities(noise) for noise in noises]).T
+    gyro, accel, gap_gyro, gap_accel, gyro_walk, accel_walk, rate, tilt, heading = squared
+    without, gap = parts.without, parts.gap_s
+    force = (accel * span + gap_accel * gap)[:, None, None] * _I
+    turn = np.where(without, rate * span**3 / 3.0, gyro * span + gap_gyro * gap)
+    h = span[:, None, None]
+    Q = np.zeros((len(span), MOVING, MOVING))
+    Q[:, V_, V_] = force
+    Q[:, P_, V_] = Q[:, V_, P_] = 0.5 * h * force
+    Q[:, P_, P_] = h * h / 3.0 * force
+    Q[:, PHI, PHI] = turn[:, None, None] * _I
+    walks = np.zeros((len(span), BLOCK))
+    walks[:, GYRO_BIAS] = (span * np.where(without, rate, gyro_walk))[:, None]
+    walks[:, ACCEL_BIAS] = (span * accel_walk)[:, None]
+    walks[:, MOUNT] = np.where(without, span * np.array((tilt, tilt, heading)), 0.0).T
+    return Q, walks[:, MOVING:]
+
+
+def _densities(noise: Noise) -> tuple[float, ...]:
+    return (
+        noise.gyro_rad,
+        noise.accel_mps,
+        noise.gap_gyro_rad,
+        noise.gap_accel_mps,
+        noise.gyro_bias_radps,
+        noise.accel_bias_mps2,
+        noise.gap_rate_radps,
+        noise.gap_tilt_rad,
+        noise.gap_heading_rad,
+    )

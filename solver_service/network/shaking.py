@@ -90,21 +90,22 @@ class NetShaking:
         return NetShaking(np.clip(self.logs + step, *_BOUNDS), information, parts)
 
 
-def shaking_parts(R: Floats, span_s: float) -> Floats:
-    """Give what shaking of unit variances adds in a step to a node's plain errors, (2, MOVING, MOVING).
+def shaking_parts(R: Floats, span_s: Floats) -> Floats:
+    """Give what shaking of unit variances adds in steps of (n,) to nodes' plain errors, (n, 2, MOVING, MOVING).
 
-    R (3, 3): its attitude at the end. As track/shaking.shaking_noise, for one node.
+    R (n, 3, 3): their attitudes at the end. As track/shaking.shaking_noise, for one node each.
     """
     a, t = kept_share(span_s), SHAKEN_S
-    fresh, both = 1.0 - a * a, t * (1.0 - a) ** 2
-    out = np.zeros((2, MOVING, MOVING))
-    angle, velocity = out
-    angle[PHI, PHI] = angle[SHAKE, SHAKE] = fresh * _I
-    angle[PHI, SHAKE] = -fresh * R
-    angle[SHAKE, PHI] = -fresh * R.T
-    velocity[V_, V_] = velocity[SHOVE, SHOVE] = fresh * _I
-    velocity[V_, SHOVE] = velocity[SHOVE, V_] = -fresh * _I
-    velocity[P_, V_] = velocity[V_, P_] = both * _I
-    velocity[P_, SHOVE] = velocity[SHOVE, P_] = -both * _I
-    velocity[P_, P_] = t * t * np.maximum(2.0 * span_s / t - 3.0 + 4.0 * a - a * a, 0.0) * _I
+    fresh, both = ((share[:, None, None] * _I) for share in (1.0 - a * a, t * (1.0 - a) ** 2))
+    out = np.zeros((len(R), 2, MOVING, MOVING))
+    angle, velocity = out[:, 0], out[:, 1]
+    angle[:, PHI, PHI] = angle[:, SHAKE, SHAKE] = fresh
+    angle[:, PHI, SHAKE] = -fresh @ R
+    angle[:, SHAKE, PHI] = np.swapaxes(angle[:, PHI, SHAKE], 1, 2)
+    velocity[:, V_, V_] = velocity[:, SHOVE, SHOVE] = fresh
+    velocity[:, V_, SHOVE] = velocity[:, SHOVE, V_] = -fresh
+    velocity[:, P_, V_] = velocity[:, V_, P_] = both
+    velocity[:, P_, SHOVE] = velocity[:, SHOVE, P_] = -both
+    way = t * t * np.maximum(2.0 * span_s / t - 3.0 + 4.0 * a - a * a, 0.0)
+    velocity[:, P_, P_] = way[:, None, None] * _I
     return out

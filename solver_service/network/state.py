@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Final
 
@@ -37,6 +38,9 @@ GAUGE: Final = 29
 BLOCK: Final = 30
 MOVING: Final = 15
 """The first errors of a block, which a step moves; the others are constants or walk slowly."""
+
+POSED: Final = PHI.stop
+"""The first errors of a block, of what a pose is made of: place, velocity and attitude."""
 
 # Clocks kept by chrony differ by less than this, 1 sd; so do others after `align` or `--clock-offset`.
 CLOCK_S: Final = 0.01
@@ -119,13 +123,28 @@ class NetState:
         """Return the state of some members, in the order given."""
         return replace(self, **{name: getattr(self, name)[members] for name in _OF_NODES})
 
+    def replaced(self, members: list[int], after: NetState) -> NetState:
+        """Return the state with what moves of some members as it is in another state of these alone."""
+        moved = {name: getattr(self, name).copy() for name in _MOVED}
+        for name, values in moved.items():
+            values[members] = getattr(after, name)
+        return replace(self, **moved)
+
     def joined(self, other: NetState) -> NetState:
         """Return the members of both states, those of the other behind."""
-        both = {name: np.concatenate((getattr(self, name), getattr(other, name))) for name in _OF_NODES}
-        return replace(self, **both)  # type: ignore[arg-type]
+        return NetState.behind((self, other))
+
+    @classmethod
+    def behind(cls, states: Sequence[NetState]) -> NetState:
+        """Return the members of several states, one behind another, with the datum of the first."""
+        every = {name: np.concatenate([getattr(state, name) for state in states]) for name in _OF_NODES}
+        return replace(states[0], **every)  # type: ignore[arg-type]
 
 
 _OF_NODES: Final = tuple(field.name for field in fields(NetState) if field.name != "datum_m")
+
+
+_MOVED: Final = ("p_m", "v_mps", "R", "shake_rad", "shove_mps")
 
 
 def _turned(turn: Floats, vectors: Floats) -> Floats:
@@ -144,16 +163,20 @@ def blocks(members: list[int]) -> list[int]:
 
 
 def own_of_plain(p_m: Floats, v_mps: Floats, shove_mps: Floats) -> Floats:
-    """Give (MOVING, MOVING): a node's errors from those with plain p_true - p, v_true - v and shove likewise."""
-    T = np.eye(MOVING)
-    T[P_, PHI], T[V_, PHI], T[SHOVE, PHI] = skew(np.stack((p_m, v_mps, shove_mps)))
-    return T
+    """Give (..., MOVING, MOVING): nodes' errors from those with plain p_true - p, v_true - v and shove likewise."""
+    return _turning(skew(np.array((p_m, v_mps, shove_mps))))
 
 
 def plain_of_own(p_m: Floats, v_mps: Floats, shove_mps: Floats) -> Floats:
     """Give the inverse of `own_of_plain`."""
-    T = np.eye(MOVING)
-    T[P_, PHI], T[V_, PHI], T[SHOVE, PHI] = -skew(np.stack((p_m, v_mps, shove_mps)))
+    return _turning(-skew(np.array((p_m, v_mps, shove_mps))))
+
+
+def _turning(crosses: Floats) -> Floats:
+    """Give (..., MOVING, MOVING) errors with the part (3, ..., 3, 3) of phi in those of p, v and shove."""
+    T = np.zeros((*crosses.shape[1:-2], MOVING, MOVING))
+    T[...] = np.eye(MOVING)
+    T[..., P_, PHI], T[..., V_, PHI], T[..., SHOVE, PHI] = crosses
     return T
 
 

@@ -14,16 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.network.motion import Move
-from buddyline.solver_service.network.state import PHI, V_, NetState, block
-
-# Of each member's errors, those that a pose is made of: place, velocity and attitude.
-_POSED: Final = PHI.stop
-assert V_.stop <= _POSED
+from buddyline.solver_service.network.state import POSED, NetState, block
 
 Adjoint: TypeAlias = tuple[Floats, Floats]
 
@@ -120,8 +116,8 @@ class Told:
         n, posed = len(self.state), _posed(len(self.state))
         error = np.zeros(len(mu))
         error[posed] = self.covariance @ mu
-        own = self.covariance.reshape(n, _POSED, -1)
-        prior = np.stack([own[i][:, block(i)][:, :_POSED] for i in range(n)])
+        own = self.covariance.reshape(n, POSED, -1)
+        prior = np.stack([own[i][:, block(i)][:, :POSED] for i in range(n)])
         return self.state.plus(error), prior - own @ L @ np.swapaxes(own, 1, 2)
 
 
@@ -164,4 +160,4 @@ class NetTrail:
 
 
 def _posed(n: int) -> list[int]:
-    return [index for i in range(n) for index in range(block(i).start, block(i).start + _POSED)]
+    return [index for i in range(n) for index in range(block(i).start, block(i).start + POSED)]

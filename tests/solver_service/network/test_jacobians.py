@@ -11,7 +11,7 @@ from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rot
 from buddyline.solver_service.network.belief import Member
 from buddyline.solver_service.network.estimate import NetEstimate, PairFix
 from buddyline.solver_service.network.filter import inverted
-from buddyline.solver_service.network.motion import Move, moved_member
+from buddyline.solver_service.network.motion import Move, moved_members
 from buddyline.solver_service.network.sights import columns, light_positions
 from buddyline.solver_service.network.state import (
     ACCEL_BIAS,
@@ -110,13 +110,11 @@ def test_a_step() -> None:
         moved = state.plus(whole)
         grid, values, slow = samples(moved, member, 0.0)
         told = np.ones((1, len(grid) - 1), dtype=bool)
-        parts = integrate(moved.chosen([member]), SampleGrid(grid[None], values[None], told, slow[None]))
-        noise = Noise(1e-3, 1e-2)
-        fields, found["F"], _, _ = moved_member(moved, member, parts, 0, noise, np.full(2, 1e-6), span_s)
-        every = {name: getattr(moved, name).copy() for name in fields}
-        for name, value in fields.items():
-            every[name][member] = value
-        return replace(moved, **every)
+        own = moved.chosen([member])
+        parts = integrate(own, SampleGrid(grid[None], values[None], told, slow[None]))
+        end, F, _, _ = moved_members(own, parts, [Noise(1e-3, 1e-2)], np.full((1, 2), 1e-6), span_s)
+        found["F"] = F[0]
+        return moved.replaced([member], end)
 
     found: dict[str, Floats] = {}
     still = after(np.zeros(BLOCK))
