@@ -36,7 +36,7 @@ from buddyline.solver_service.network.estimate import NetEstimate
 from buddyline.solver_service.network.rows import DueNetRow, plain_of_posed
 from buddyline.solver_service.network.state import POSED, NetState, block
 from buddyline.solver_service.network.trail import Told
-from buddyline.solver_service.tracking import PairTracker
+from buddyline.solver_service.tracking import Coming, PairTracker
 
 START_NS = 1_764_000_000_000_000_000
 # Beyond these a row is wrong, as `evaluate` has it.
@@ -149,7 +149,7 @@ def solved(messages: Sequence[Message], mode: str, hz: float) -> NetRun:
         note(self.stamp_ns, [one.node for one in self.members], after, P)
         return after, own
 
-    silent = {"take": lambda *_: [], "finish": lambda *_: []}
+    silent = {"follow": lambda *_: Coming(), "told": lambda *_: [], "finish": lambda *_: []}
     with (
         patch.object(NetEstimate, "due_row", due_row),
         patch.object(Told, "smoothed", back),

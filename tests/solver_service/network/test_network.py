@@ -18,7 +18,7 @@ from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, r
 from buddyline.solver_service.network import filter as filter_module
 from buddyline.solver_service.network.estimate import NetEstimate
 from buddyline.solver_service.network.filter import NetFilter
-from buddyline.solver_service.tracking import PairTracker
+from buddyline.solver_service.tracking import Coming, PairTracker
 from msgspec.structs import replace
 
 START_NS = 1_764_000_000_000_000_000
@@ -60,8 +60,8 @@ def errors(world: World, poses: list[NodePose], origin: str | None = None) -> di
 def no_tracks_of_pairs() -> Iterator[None]:
     """The network uses none of them, and they take two thirds of the time."""
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("take", "finish"):
-            patch.setattr(PairTracker, name, lambda *_: [])
+        for name, told in (("follow", Coming()), ("told", []), ("finish", [])):
+            patch.setattr(PairTracker, name, lambda *_, told=told: told)
         yield
 
 
