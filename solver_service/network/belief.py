@@ -33,7 +33,7 @@ from buddyline.solver_service.network.state import (
 )
 from buddyline.solver_service.network.trail import Chosen, Grown, Learned, NetTrail
 from buddyline.solver_service.track import anchors
-from buddyline.solver_service.track.inputs import AttitudeSeen, TrackNode
+from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, TrackNode
 from buddyline.solver_service.track.intake import TrackIntake, newest_before
 from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S, WITHOUT_RAD, WITHOUT_RADPS, excerpt, increments
 from buddyline.solver_service.track.stepping import ATTITUDE_EVERY_S, TICK_S
@@ -41,6 +41,8 @@ from buddyline.solver_service.track.strapdown import Noise
 
 # With fixed nodes the heading of an attitude gets this factor: it does not count.
 FREE_HEADING: Final = 1e6
+# All gauges are used together once the datum is known better than this, 1 sd.
+KNOWN_DATUM_M: Final = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,8 +265,8 @@ class NetBelief:
             self.trail.moved(move)
         self.covariance = move.covariance(self.covariance)
         self.t_s = t_s
+        self._take_depths()
         for index, member in enumerate(self.members):
-            self._take_depth(index, member)
             if member.node not in self.places:
                 self._take_attitude(index, member)
                 self._take_turning(index, member)
@@ -281,30 +283,39 @@ class NetBelief:
             self.shaking = self.shaking.taught(y, S_inverse, H, before)
         self.state = self.state.plus(error)
 
-    def _take_depth(self, index: int, member: Member) -> None:
-        """Update by a depth gauge: h = p_z + (R port)_z - v_z age + offset + datum."""
+    def _take_depths(self) -> None:
+        """Update by all new depths."""
+        news: list[tuple[int, float, DepthSeen]] = []
+        for index, member in enumerate(self.members):
+            found = newest_before(self.intake.depths[member.node], self.t_s)
+            if found is not None and found[0] > member.depth_s and self.t_s - found[0] <= 0.3:
+                member.depth_s = found[0]
+                news.append((index, self.t_s - found[0], found[1]))
+        # Beside a variance as that of an unknown datum, together they would lose all digits of their own.
+        together = self.covariance[0, 0] < KNOWN_DATUM_M**2
+        for some in [news] if together else [[one] for one in news]:
+            self._take_gauges(some)
+
+    def _take_gauges(self, news: Sequence[tuple[int, float, DepthSeen]]) -> None:
+        """Update by some gauges in one: h = p_z + (R port)_z - v_z age + offset + datum. news: member, age, message."""
         assert self.state is not None
-        found = newest_before(self.intake.depths[member.node], self.t_s)
-        if found is None or found[0] <= member.depth_s or self.t_s - found[0] > 0.3:
-            return
-        time_s, seen = found
-        member.depth_s = time_s
-        age_s = self.t_s - time_s
         state = self.state
-        port = state.R[index] @ self.nodes[member.node].rig.depth_port_m
-        place = state.p_m[index] - age_s * state.v_mps[index] + port
-        y = np.array((seen.depth_m - place[2] - state.gauge_m[index] - state.datum_m,))
-        H = np.zeros((1, len(self.covariance)))
-        own = H[:, block(index)]
-        own[0, P_.stop - 1], own[0, V_.stop - 1] = 1.0, -age_s
-        own[0, PHI] = place[1], -place[0], 0.0
-        own[0, GAUGE] = 1.0
-        H[0, 0] = 1.0
-        # A frame that moves with a node may have risen or sunk since, by some 0.3 m/s.
-        drift_m = 0.0 if self.anchor is None else 0.3 * age_s
-        noise = np.array(((seen.sigma_m**2 + drift_m**2 + 1e-6,),))
-        if y[0] ** 2 < 16.0 * float((H @ self.covariance @ H.T + noise)[0, 0]):
-            self._apply(H, y, noise)
+        y, noise, H = np.zeros(len(news)), np.zeros(len(news)), np.zeros((len(news), len(self.covariance)))
+        H[:, 0] = 1.0
+        for row, (index, age_s, seen) in enumerate(news):
+            port = state.R[index] @ self.nodes[self.members[index].node].rig.depth_port_m
+            north, east, down = (state.p_m[index] - age_s * state.v_mps[index] + port).tolist()
+            y[row] = seen.depth_m - down - state.gauge_m[index] - state.datum_m
+            own = H[row, block(index)]
+            own[P_.stop - 1], own[V_.stop - 1] = 1.0, -age_s
+            own[PHI] = east, -north, 0.0
+            own[GAUGE] = 1.0
+            # A frame that moves with a node may have risen or sunk since, by some 0.3 m/s.
+            drift_m = 0.0 if self.anchor is None else 0.3 * age_s
+            noise[row] = seen.sigma_m**2 + drift_m**2 + 1e-6
+        kept = within(y, H @ self.covariance @ H.T + np.diag(noise))
+        if kept:
+            self._apply(H[kept], y[kept], np.diag(noise[kept]))
 
     def _take_attitude(self, index: int, member: Member) -> None:
         found = newest_before(self.intake.attitudes[member.node], self.t_s)
@@ -355,3 +366,16 @@ class NetBelief:
         J = plain_of_posed(self.state.p_m[index], self.state.v_mps[index])[P_]
         own = self.covariance[block(index), block(index)][:POSED, :POSED]
         return math.sqrt(max(float(np.trace(J @ own @ J.T)), 0.0))
+
+
+def within(y: Floats, S: Floats) -> list[int]:
+    """Give which of some residuals (m,) of a covariance (m, m) are within 4 sigma, each by those before it."""
+    y, S, kept = y.copy(), S.copy(), []
+    for row in range(len(y)):
+        if y[row] ** 2 < 16.0 * S[row, row]:
+            kept.append(row)
+            # What it tells of those after it.
+            gain = S[row + 1 :, row] / S[row, row]
+            y[row + 1 :] -= gain * y[row]
+            S[row + 1 :, row + 1 :] -= np.outer(gain, S[row, row + 1 :])
+    return kept

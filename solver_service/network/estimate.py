@@ -6,20 +6,21 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import Final
 
 import numpy as np
 from buddyline.protocol.blinking import lit
 from buddyline.protocol.messages import Blink
-from buddyline.solver_service.geometry.rotation import Floats, rotation_log, skew
+from buddyline.solver_service.geometry.rotation import Floats, Indices, rotation_log, skew
 from buddyline.solver_service.network.belief import Member, NetBelief
 from buddyline.solver_service.network.exclusive import share
 from buddyline.solver_service.network.rows import DueNetRow, NetRow, rows_of
-from buddyline.solver_service.network.sights import columns, light_positions
+from buddyline.solver_service.network.sights import SightArrays, columns, light_positions
 from buddyline.solver_service.network.state import BLOCK, P_, PHI, V_, block, lone
 from buddyline.solver_service.network.trail import Present, Told
 from buddyline.solver_service.track import anchors
-from buddyline.solver_service.track.association import odds_of
+from buddyline.solver_service.track.association import Odds, odds_of
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.intake import TrackIntake, newest_before
 from buddyline.solver_service.track.lights import Sight, in_picture, pixel_of, residuals
@@ -27,6 +28,7 @@ from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S
 from buddyline.solver_service.track.seeing import EDGE_PX
 from buddyline.solver_service.track.start import tilt_of
 from buddyline.solver_service.track.stepping import TICK_S
+from numpy.typing import NDArray
 
 # A node is confirmed once its lights explain the pictures better than clutter by this (log odds). It leaves below
 # GIVEN_UP, or when it has not been confirmed within PATIENCE_S.
@@ -42,10 +44,13 @@ LOST_M: Final = 1.5
 OUTSIDE_PX: Final = 60.0
 # How likely a lamp that is switched off by its code is in the picture after all: it was switched late.
 SHOWN_DARK: Final = 0.01
+# How likely a light is found, before pictures have told.
+FIRST_DETECTION: Final = np.full(2, 0.8)
 # What iron near a compass, or acceleration, adds to an attitude's sigmas (roll, pitch, yaw) when a join is checked.
 IRON_RAD: Final = np.radians((1.0, 1.0, 8.0))
 # For so long after a pose made a node a member, its lights are not used: they are those of the pose.
 SKIP_S: Final = 0.02
+_POSE: Final = np.r_[P_, PHI]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -54,6 +59,15 @@ class PairFix(FixSeen):
 
     node: int = 0
     other: int = 0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Bar:
+    """Another member's bar in one member's picture, by their places among the members."""
+
+    observer: int
+    other: int
+    sight: Sight
 
 
 class NetEstimate(NetBelief):
@@ -87,60 +101,93 @@ class NetEstimate(NetBelief):
 
     # Lights
 
-    def take_sight(self, t_s: float, sight: Sight) -> None:
-        """Go on to a picture, and use the lights in it."""
+    def take_sights(self, t_s: float, sights: Sequence[Sight]) -> None:
+        """Go on to some pictures of one trigger, and use the lights in them."""
         if self.state is None or t_s < self.t_s - TOGETHER_S:
             return
         self.step(t_s)
-        index = self.member_of(sight.node)
-        if index is not None:
-            self._take_lights(index, sight)
+        seen = [(index, sight) for sight in sights if (index := self.member_of(sight.node)) is not None]
+        if seen:
+            self._take_lights(seen)
             self._judge()
 
-    def _take_lights(self, observer: int, sight: Sight) -> None:
+    def _take_lights(self, seen: Sequence[tuple[int, Sight]]) -> None:
+        """Use the lights in pictures of some members; all bars in all pictures are worked out together."""
         assert self.state is not None
-        camera = self.nodes[sight.node].rig.camera
-        dt_s = sight.dt_s + (sight.t_s - self.t_s)
-        others = [other for other in range(len(self.members)) if self._may_show(observer, other, sight)]
-        if not others:
+        bars = [
+            Bar(observer, other, sight)
+            for observer, sight in seen
+            for other in range(len(self.members))
+            if self._may_show(observer, other, sight)
+        ]
+        if not bars:
             return
+        observers, others = [bar.observer for bar in bars], [bar.other for bar in bars]
+        candidates = SightArrays([bar.sight for bar in bars])
+        times_s = candidates.dt_s + np.array([[bar.sight.t_s - self.t_s] for bar in bars])
         lights_m = np.array([self.nodes[self.members[other].node].rig.lights_m for other in others])
-        X, D = light_positions(self.state, observer, others, lights_m, self.rates_radps, dt_s)
-        which = np.array([columns(observer, other) for other in others])
+        X, D = light_positions(self.state, observers, others, lights_m, self.rates_radps, times_s)
+        which = columns(observers, others)
         P = self.covariance[which[:, :, None], which[:, None, :]]
         first = D[:, 0, 0]
         spread_m2 = np.trace(first @ P @ np.swapaxes(first, 1, 2), axis1=1, axis2=2)
         wide = spread_m2 > 0.01 * (X[:, 0, 0] ** 2).sum(axis=1)
-        kept, likely, inside = [], [], []
-        for bar, other in enumerate(others):
-            node = self.members[other].node
-            pixels = [pixel_of(camera, X[bar, 0, light]) for light in (0, 1)]
-            if not wide[bar] and not any(in_picture(camera, pixel, -OUTSIDE_PX) for pixel in pixels):
-                continue
-            within = [bool(wide[bar]) or in_picture(camera, pixel, EDGE_PX) for pixel in pixels]
-            detection = self.detection.setdefault((sight.node, node), np.full(2, 0.8))
-            shines = self._lit(node, sight)
-            kept.append(bar)
-            likely.append(np.where(shines, detection * np.where(within, 1.0, 0.02), SHOWN_DARK))
-            inside.append([there and on for there, on in zip(within, shines, strict=True)])
+        if wide.any() and len(seen) > 1:
+            # Where little is known, the second picture's lights are linear only about where the first one's put them.
+            for one in seen:
+                self._take_lights([one])
+            return
+        within = [self._within(bar, X[n, 0], wide=bool(wide[n])) for n, bar in enumerate(bars)]
+        kept = [n for n, inside in enumerate(within) if inside is not None]
         if not kept:
             return
-        y, H = residuals(sight.bearings, sight.tangents, X[kept], D[kept])
-        clutter = np.full(len(kept), sight.clutter / camera.area_px2)
-        every = odds_of(y, H, P[kept], np.tile(sight.sigma_px, (len(kept), 1)), clutter)
-        shared = share([odds.weighed(found) for odds, found in zip(every, likely, strict=True)], sight.sigma_px)
-        compared = [(others[bar], which[bar], y[place], H[place]) for place, bar in enumerate(kept)]
-        self.evidence += shared.total
-        for (other, *_), seen, gained, within in zip(compared, shared.seen, shared.evidence, inside, strict=True):
-            member = self.members[other]
-            for one in (member, self.members[observer]):
-                if not one.confirmed:
-                    one.evidence += float(gained)
-            detection = self.detection[sight.node, member.node]
-            detection += 0.05 * np.where(within, seen - detection, 0.0)
-            np.clip(detection, 0.02, 0.97, out=detection)
-        if shared.chosen:
-            self._update(observer, sight, shared.chosen, compared)
+        bars, which, inside = [bars[n] for n in kept], which[kept], np.array([within[n] for n in kept])
+        y, H = residuals(candidates.bearings[kept], candidates.tangents[kept], X[kept], D[kept])
+        clutter = np.array([bar.sight.clutter / self.nodes[bar.sight.node].rig.camera.area_px2 for bar in bars])
+        odds = odds_of(y, H, P[kept], candidates.sigma_px[kept], clutter)
+        chosen = self._associate(bars, odds, inside)
+        if chosen:
+            self._update(bars, which, y, H, chosen)
+
+    def _within(self, bar: Bar, X: Floats, *, wide: bool) -> tuple[bool, bool] | None:
+        """Tell which of a bar's lights ought to be in the picture by where they stand, X (2, 3) before the camera.
+
+        None where the whole bar is outside. wide: whether its place is known too poorly to tell.
+        """
+        if wide:
+            return True, True
+        camera = self.nodes[bar.sight.node].rig.camera
+        left, right = (pixel_of(camera, light) for light in X)
+        if not (in_picture(camera, left, -OUTSIDE_PX) or in_picture(camera, right, -OUTSIDE_PX)):
+            return None
+        return in_picture(camera, left, EDGE_PX), in_picture(camera, right, EDGE_PX)
+
+    def _associate(
+        self, bars: Sequence[Bar], odds: Sequence[Odds], inside: NDArray[np.bool_]
+    ) -> list[tuple[int, int, int, float]]:
+        """Choose the lights that are sure, as bar, candidate, light and variance; learn how well pictures are explained
+        and how often lights are found. inside (B, 2): whether each is in the picture."""
+        pairs = [(bar.sight.node, self.members[bar.other].node) for bar in bars]
+        lit = np.array([self._lit(other, bar.sight) for bar, (_, other) in zip(bars, pairs, strict=True)])
+        detection = np.array([self.detection.get(pair, FIRST_DETECTION) for pair in pairs])
+        likely = np.where(lit, detection * np.where(inside, 1.0, 0.02), SHOWN_DARK)
+        weighed = [one.weighed(found) for one, found in zip(odds, likely, strict=True)]
+        chosen: list[tuple[int, int, int, float]] = []
+        seen = np.zeros((len(bars), 2))
+        # Each candidate of a picture is one lamp's at most.
+        for _, of_sight in groupby(range(len(bars)), key=lambda n: id(bars[n].sight)):
+            ns = list(of_sight)
+            shared = share([weighed[n] for n in ns], bars[ns[0]].sight.sigma_px)
+            chosen += [(ns[bar], k, light, variance) for k, bar, light, variance in shared.chosen]
+            seen[ns] = shared.seen
+            self.evidence += shared.total
+            for n, gained in zip(ns, shared.evidence.tolist(), strict=True):
+                for one in (self.members[bars[n].other], self.members[bars[n].observer]):
+                    if not one.confirmed:
+                        one.evidence += gained
+        detection = np.clip(detection + 0.05 * np.where(inside & lit, seen - detection, 0.0), 0.02, 0.97)
+        self.detection.update(zip(pairs, detection, strict=True))
+        return chosen
 
     def _may_show(self, observer: int, other: int, sight: Sight) -> bool:
         """Whether a picture of a member may tell of another's lights."""
@@ -155,19 +202,21 @@ class NetEstimate(NetBelief):
 
     def _update(
         self,
-        observer: int,
-        sight: Sight,
+        bars: Sequence[Bar],
+        which: Indices,
+        y: Floats,
+        H: Floats,
         chosen: Sequence[tuple[int, int, int, float]],
-        compared: Sequence[tuple[int, Floats, Floats, Floats]],
     ) -> None:
-        rows_y = np.concatenate([compared[bar][2][k, light] for k, bar, light, _ in chosen])
-        H = np.zeros((len(rows_y), len(self.covariance)))
-        for row, (k, bar, light, _) in enumerate(chosen):
-            H[2 * row : 2 * row + 2, compared[bar][1]] = compared[bar][3][k, light]
-            for member in (self.members[compared[bar][0]], self.members[observer]):
-                member.light_s = max(member.light_s, sight.t_s)
-        noise = np.diag(np.repeat([variance for *_, variance in chosen], 2))
-        self._apply(H, rows_y, noise, teaches=True)
+        """Update by the lights chosen, each by bar, candidate, light and variance; which (B, WIDTH): as `columns`."""
+        n, k, light, variances = (np.array(each) for each in zip(*chosen, strict=True))
+        rows = np.zeros((len(chosen), 2, len(self.covariance)))
+        rows[np.arange(len(chosen))[:, None, None], [[0], [1]], which[n][:, None]] = H[n, k, light]
+        for bar in (bars[one] for one, *_ in chosen):
+            for member in (self.members[bar.other], self.members[bar.observer]):
+                member.light_s = max(member.light_s, bar.sight.t_s)
+        noise = np.diag(np.repeat(variances, 2))
+        self._apply(rows.reshape(2 * len(chosen), -1), y[n, k, light].ravel(), noise, teaches=True)
 
     def _judge(self) -> None:
         """Confirm members, and remove those of which no light tells any more."""
@@ -240,13 +289,13 @@ class NetEstimate(NetBelief):
         toward = state.R[one].T
         away = state.p_m[two] - state.p_m[one]
         gap = np.concatenate((fix.t_a_b_m - toward @ away, rotation_log(fix.R_a_b @ (toward @ state.R[two]).T)))
-        H = np.zeros((6, len(self.covariance)))
-        mine, yours = H[:, block(one)], H[:, block(two)]
-        yours[:3, P_], mine[:3, P_] = toward, -toward
-        yours[:3, PHI] = -toward @ skew(state.p_m[two])
-        mine[:3, PHI] = toward @ (skew(state.p_m[one]) + skew(away))
-        yours[3:, PHI], mine[3:, PHI] = toward, -toward
-        S = H @ self.covariance @ H.T + fix.covariance + np.diag([1e-4] * 3 + [1e-5] * 3)
+        # By place and attitude of the one, then of the other.
+        H = np.zeros((6, 12))
+        H[:3, 0:3], H[:3, 3:6] = -toward, toward @ (skew(state.p_m[one]) + skew(away))
+        H[:3, 6:9], H[:3, 9:12] = toward, -toward @ skew(state.p_m[two])
+        H[3:, 3:6], H[3:, 9:12] = -toward, toward
+        which = np.concatenate([block(member).start + _POSE for member in (one, two)])
+        S = H @ self.covariance[which[:, None], which] @ H.T + fix.covariance + np.diag([1e-4] * 3 + [1e-5] * 3)
         return gap, float(gap @ np.linalg.solve(S, gap))
 
     # Rows

@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from operator import itemgetter
+from typing import Final, NamedTuple
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
@@ -23,6 +24,18 @@ MOST_TOGETHER: Final = 600
 
 Joint = tuple[float, tuple[int, ...], frozenset[int]]
 """Log odds, the place of each bar's case so far, and the candidates that they use."""
+
+
+class _Choice(NamedTuple):
+    """One bar's case, the log of its odds, and the candidates that it uses."""
+
+    case: Case
+    log: float
+    used: frozenset[int]
+
+    @classmethod
+    def of(cls, case: Case, log: float) -> _Choice:
+        return cls(case, log, frozenset(picked[0] for picked in case if picked is not None))
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +58,7 @@ def share(bars: Sequence[tuple[list[Case], Floats]], sigma_px: Floats) -> Shared
     kept = [_likely(cases, logs) for cases, logs in bars]
     chosen: list[tuple[int, int, int, float]] = []
     seen, evidence, total = np.zeros((len(bars), 2)), np.zeros(len(bars)), 0.0
-    for group in _groups([frozenset(k for case, _ in some for k in _used(case)) for some in kept]):
+    for group in _groups([frozenset().union(*(one.used for one in some)) for some in kept]):
         joint = _joint([kept[bar] for bar in group])
         logs = np.array([log for log, _, _ in joint])
         top = float(logs.max())
@@ -56,7 +69,7 @@ def share(bars: Sequence[tuple[list[Case], Floats]], sigma_px: Floats) -> Shared
         marginal: dict[tuple[int, int, int], list[float]] = {}
         for weight, (_, places, _) in zip(weights.tolist(), joint, strict=True):
             for place, bar in zip(places, group, strict=True):
-                for light, picked in enumerate(kept[bar][place][0]):
+                for light, picked in enumerate(kept[bar][place].case):
                     if picked is not None:
                         seen[bar, light] += weight
                         marginal.setdefault((picked[0], bar, light), [0.0, 0.0])[picked[1]] += weight
@@ -70,17 +83,13 @@ def share(bars: Sequence[tuple[list[Case], Floats]], sigma_px: Floats) -> Shared
     return Shared(tuple(chosen), seen, evidence, total)
 
 
-def _likely(cases: list[Case], logs: Floats) -> list[tuple[Case, float]]:
+def _likely(cases: list[Case], logs: Floats) -> list[_Choice]:
     order = np.argsort(-logs, kind="stable")[:MOST_CASES].tolist()
-    best = float(logs[order[0]])
-    kept = [i for i in order if logs[i] > best - WEIGHED]
+    every = logs.tolist()
+    kept = [i for i in order if every[i] > every[order[0]] - WEIGHED]
     # That a bar is not seen at all is possible whatever else is.
     missing = cases.index((None, None))
-    return [(cases[i], float(logs[i])) for i in (kept if missing in kept else [*kept, missing])]
-
-
-def _used(case: Case) -> list[int]:
-    return [picked[0] for picked in case if picked is not None]
+    return [_Choice.of(cases[i], every[i]) for i in (kept if missing in kept else [*kept, missing])]
 
 
 def _groups(wants: Sequence[frozenset[int]]) -> list[list[int]]:
@@ -94,17 +103,17 @@ def _groups(wants: Sequence[frozenset[int]]) -> list[list[int]]:
     return [members for members, _ in groups]
 
 
-def _joint(bars: Sequence[list[tuple[Case, float]]]) -> list[Joint]:
+def _joint(bars: Sequence[list[_Choice]]) -> list[Joint]:
     """Give the likeliest choices of a case for each bar in which no candidate is used twice."""
     found: list[Joint] = [(0.0, (), frozenset())]
-    for cases in bars:
+    for choices in bars:
         found = [
-            (log + own, (*places, place), used.union(_used(case)))
+            (log + choice.log, (*places, place), used | choice.used)
             for log, places, used in found
-            for place, (case, own) in enumerate(cases)
-            if used.isdisjoint(_used(case))
+            for place, choice in enumerate(choices)
+            if used.isdisjoint(choice.used)
         ]
-        found.sort(key=lambda one: -one[0])
+        found.sort(key=itemgetter(0), reverse=True)
         del found[MOST_TOGETHER:]
     return found
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import heapq
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -138,7 +139,7 @@ class NetFilter(TrackIntake):
             elif isinstance(what, PairFix):
                 self._take_fix(t_s, what)
             elif isinstance(what, Sight):
-                self._take_sight(t_s, what)
+                self._take_sights(t_s, [what, *self._beside(t_s)])
         self._forget_before(end_s - MEMORY_S)
         return rows + make_rows(due)
 
@@ -192,13 +193,29 @@ class NetFilter(TrackIntake):
         """Take a pose that one trigger's lights gave by themselves: of the node `other` from the node `node`."""
         self.add_fix(PairFix(fix.stamp_ns, fix.t_a_b_m, fix.R_a_b, fix.covariance, node, other))
 
-    def _take_sight(self, t_s: float, sight: Sight) -> None:
+    def _beside(self, t_s: float) -> list[Sight]:
+        """Take the other pictures of a trigger, less than TOGETHER_S after the first of t_s, out of the events.
+
+        Fixes and rows in between come after all of them.
+        """
+        found, passed = [], []
+        while self._events and self._events[0][0] < t_s + TOGETHER_S:
+            event = heapq.heappop(self._events)
+            if isinstance(event[3], Sight):
+                found.append(event[3])
+            else:
+                passed.append(event)
+        for event in passed:
+            heapq.heappush(self._events, event)
+        return found
+
+    def _take_sights(self, t_s: float, sights: Sequence[Sight]) -> None:
         self._check_units(t_s)
         self._check_fixed(t_s)
         if self.main.state is None and self.main.places:
             self.main.begin(t_s)
         for estimate in [self.main, *self.challengers]:
-            estimate.take_sight(t_s, sight)
+            estimate.take_sights(t_s, sights)
         self._judge(t_s)
 
     def _check_fixed(self, t_s: float) -> None:
@@ -233,20 +250,17 @@ class NetFilter(TrackIntake):
         if t_s < main.t_s - TOGETHER_S:
             return
         recent = self._fixes.setdefault((fix.node, fix.other), [])
-        if recent and not _in_reach(recent[-1], (t_s, fix)):
-            recent.clear()
         recent.append((t_s, fix))
         del recent[:-FIXES_TO_JOIN]
-        settled = len(recent) == FIXES_TO_JOIN
         one, two = main.member_of(fix.node), main.member_of(fix.other)
         if one is not None and two is not None:
-            self._compare(t_s, fix, one, two, settled=settled)
-        elif settled:
+            self._compare(t_s, fix, one, two)
+        elif _settled(recent):
             _enter(main, t_s, fix)
             for challenger in self.challengers:
                 _enter(challenger, t_s, fix)
 
-    def _compare(self, t_s: float, fix: PairFix, one: int, two: int, *, settled: bool) -> None:
+    def _compare(self, t_s: float, fix: PairFix, one: int, two: int) -> None:
         """Open challengers where poses on end contradict the estimate: either node may be the one that is off."""
         _, chi2 = self.main.gap(t_s, fix, one, two)
         pair = fix.node, fix.other
@@ -257,7 +271,7 @@ class NetFilter(TrackIntake):
         free = [node for node in pair if node not in self.main.places]
         if self._contradicted[pair] >= CONTRADICTIONS:
             self._say_contradiction(t_s, pair)
-        if not settled or t_s - self._challenged_s.get(pair, -np.inf) < AGAIN_S:
+        if not _settled(self._fixes[pair]) or t_s - self._challenged_s.get(pair, -np.inf) < AGAIN_S:
             return
         self._challenged_s[pair] = t_s
         for node in free:
@@ -295,6 +309,11 @@ def _enter(estimate: NetEstimate, t_s: float, fix: PairFix) -> None:
         estimate.join(t_s, fix, one, fix.other)
     elif one is None and two is not None:
         estimate.join(t_s, inverted(fix), two, fix.node)
+
+
+def _settled(recent: Sequence[tuple[float, PairFix]]) -> bool:
+    """Whether there are poses enough in a row, each in reach of the one before."""
+    return len(recent) == FIXES_TO_JOIN and all(_in_reach(*both) for both in pairwise(recent))
 
 
 def _in_reach(before: tuple[float, PairFix], now: tuple[float, PairFix]) -> bool:

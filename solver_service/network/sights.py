@@ -1,4 +1,4 @@
-"""Where the lights of all other members stand in one member's picture, and how the errors move them."""
+"""Where the lights of members stand in the pictures of others, and how the errors move them."""
 
 from __future__ import annotations
 
@@ -6,42 +6,47 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.rotation import Floats, skew
+from buddyline.solver_service.geometry.rotation import Floats, Indices, skew
 from buddyline.solver_service.network.state import BLOCK, CLOCK, P_, PHI, V_, NetState
-from buddyline.solver_service.track.lights import turns_over
+from buddyline.solver_service.track.lights import Sight, turns_over
 
 # The errors of the observer, then of the other node, that move a light: of each place, velocity, attitude and clock.
 OF_NODE: Final = np.r_[P_, V_, PHI, CLOCK]
 WIDTH: Final = 2 * len(OF_NODE)
 
 
-def columns(observer: int, other: int) -> Floats:
-    """Give the indices (WIDTH,) in the whole error of what moves the other's lights in the observer's picture."""
-    indices: Floats = np.concatenate((1 + BLOCK * observer + OF_NODE, 1 + BLOCK * other + OF_NODE))
+def columns(observers: Sequence[int], others: Sequence[int]) -> Indices:
+    """Give the indices (B, WIDTH) in the whole error of what moves the others' lights in the observers' pictures."""
+    of_both = np.stack((observers, others), axis=1)
+    indices: Indices = (1 + BLOCK * of_both[:, :, None] + OF_NODE).reshape(-1, WIDTH)
     return indices
 
 
 def light_positions(
-    state: NetState, observer: int, others: Sequence[int], lights_m: Floats, rates_radps: Floats, dt_s: Floats
+    state: NetState,
+    observers: Sequence[int],
+    others: Sequence[int],
+    lights_m: Floats,
+    rates_radps: Floats,
+    times_s: Floats,
 ) -> tuple[Floats, Floats]:
-    """Give other nodes' (B) lights (B, L, 3) in the observer's camera frame at times dt_s (K,) after the state's.
+    """Give other nodes' lights (B, L, 3) in observers' camera frames (B), at times_s (B, T) after the state's.
 
-    Returns X (B, K, L, 3) and D (B, K, L, 3, WIDTH): dX by the errors of `columns`. rates_radps (n, 3): turn rates.
-    Where all times are one, or there is none, K is 1. With a = p + R l the light's place in the net's frame, all
-    carried on by v and w, for the other node by the difference of both clocks too:
+    Returns X (B, T, L, 3) and D (B, T, L, 3, WIDTH): dX by the errors of `columns`. rates_radps (n, 3): turn rates.
+    With a = p + R l the light's place in the net's frame, all carried on by v and w, for the other node by the
+    difference of both clocks too:
     X = R_i^T (a - p_i),  dX = R_i^T (dp_j - dp_i + t_j dv_j - t_i dv_i - [a]x (phi_j - phi_i)) + R_i^T a' (dc_j - dc_i)
     """
-    alike = bool((dt_s == dt_s[:1]).all())
-    times = dt_s if not alike else dt_s[:1] if len(dt_s) else np.zeros(1)
-    of_other = list(others)
-    ahead = times + (state.clock_s[of_other] - state.clock_s[observer])[:, None]  # (B, T)
-    toward = np.swapaxes(state.R[observer] @ turns_over(rates_radps[observer], times), 1, 2)[:, None]  # (T, 1, 3, 3)
-    R_other = state.R[of_other][:, None] @ turns_over(rates_radps[of_other], ahead)
-    v_mps, lamps = state.v_mps[of_other][:, None], np.swapaxes(lights_m, 1, 2)
+    i, j = list(observers), list(others)
+    ahead = times_s + (state.clock_s[j] - state.clock_s[i])[:, None]  # (B, T)
+    R_observer = state.R[i][:, None] @ turns_over(rates_radps[i], times_s)
+    toward = np.swapaxes(R_observer, -1, -2)[:, :, None]  # (B, T, 1, 3, 3)
+    R_other = state.R[j][:, None] @ turns_over(rates_radps[j], ahead)
+    v_mps, lamps = state.v_mps[j][:, None], np.swapaxes(lights_m, 1, 2)
     arms = np.swapaxes(R_other @ lamps[:, None], -1, -2)  # (B, T, L, 3)
-    swept = np.swapaxes(R_other @ (skew(rates_radps[of_other]) @ lamps)[:, None], -1, -2)
-    a = (state.p_m[of_other][:, None] + ahead[..., None] * v_mps)[:, :, None] + arms
-    eye = (state.p_m[observer] + times[:, None] * state.v_mps[observer])[:, None]
+    swept = np.swapaxes(R_other @ (skew(rates_radps[j]) @ lamps)[:, None], -1, -2)
+    a = (state.p_m[j][:, None] + ahead[..., None] * v_mps)[:, :, None] + arms
+    eye = (state.p_m[i][:, None] + times_s[..., None] * state.v_mps[i][:, None])[:, :, None]
     X = (toward @ (a - eye)[..., None])[..., 0]
     D = np.zeros((*X.shape, WIDTH))
     half = WIDTH // 2
@@ -50,5 +55,26 @@ def light_positions(
     D[..., half + 6 : half + 9] = -(toward @ skew(a))
     D[..., half + 9] = (toward @ (v_mps[:, :, None] + swept)[..., None])[..., 0]
     D[..., :half] = -D[..., half:]
-    D[..., 3:6] = -toward * times[:, None, None, None]
+    D[..., 3:6] = -toward * times_s[..., None, None, None]
     return X, D
+
+
+class SightArrays:
+    """The candidates of some pictures (B) as arrays, up to as many (K) as the fullest has; a picture may come again.
+
+    bearings (B, K, 3), tangents (B, K, 2, 3), sigma_px (B, K): of what a picture does not have 0, 0 and 1. dt_s (B, T):
+    of each after its picture's time; T is 1 where all of a picture are of one time.
+    """
+
+    def __init__(self, sights: Sequence[Sight]) -> None:
+        most = max(len(sight.bearings) for sight in sights)
+        self.bearings, self.tangents = np.zeros((len(sights), most, 3)), np.zeros((len(sights), most, 2, 3))
+        self.sigma_px, dt_s = np.ones((len(sights), most)), np.zeros((len(sights), max(most, 1)))
+        for n, sight in enumerate(sights):
+            count = len(sight.bearings)
+            self.bearings[n, :count], self.tangents[n, :count] = sight.bearings, sight.tangents
+            self.sigma_px[n, :count] = sight.sigma_px
+            if count:
+                dt_s[n, :count], dt_s[n, count:] = sight.dt_s, sight.dt_s[-1]
+        # Without a rolling shutter all candidates of a picture are of one time.
+        self.dt_s = dt_s[:, :1] if (dt_s == dt_s[:, :1]).all() else dt_s

@@ -8,7 +8,7 @@ import pytest
 from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log, skew
-from buddyline.solver_service.network.belief import Member
+from buddyline.solver_service.network.belief import Member, within
 from buddyline.solver_service.network.estimate import NetEstimate, PairFix
 from buddyline.solver_service.network.filter import inverted
 from buddyline.solver_service.network.motion import Move, moved_members
@@ -81,12 +81,12 @@ def test_lights(pair: tuple[int, int]) -> None:
     observer, other = pair
     state, rates = a_state(3), np.random.default_rng(4).normal(0.0, 0.3, (3, 3))
     dt_s = np.array((-0.004, 0.006))
-    D = light_positions(state, observer, [other], LIGHTS_M[None], rates, dt_s)[1][0]
+    D = light_positions(state, [observer], [other], LIGHTS_M[None], rates, dt_s[None])[1][0]
     whole = np.zeros((*D.shape[:3], 1 + 3 * BLOCK))
-    whole[..., columns(observer, other)] = D
+    whole[..., columns([observer], [other])[0]] = D
 
     def seen(error: Floats) -> Floats:
-        return light_positions(state.plus(error), observer, [other], LIGHTS_M[None], rates, dt_s)[0][0]
+        return light_positions(state.plus(error), [observer], [other], LIGHTS_M[None], rates, dt_s[None])[0][0]
 
     assert whole == pytest.approx(differences(seen, 1 + 3 * BLOCK), abs=1e-6)
 
@@ -139,6 +139,24 @@ def test_a_frame_that_moves_with_a_node() -> None:
     N = 1 + 3 * BLOCK
     numeric = differences(lambda error: anchored(state.plus(error)).minus(anchored(state)), N)
     assert move.onward(np.eye(N)) == pytest.approx(numeric, abs=1e-6)
+
+
+def test_residuals_that_do_not_fit_those_before_them_are_left_out() -> None:
+    """As if each updated the estimate before the next one is judged."""
+    rng = np.random.default_rng(5)
+    H, noise = rng.normal(0.0, 1.0, (5, 3)), np.full(5, 0.01)
+    y = H @ rng.normal(0.0, 1.0, 3) + rng.normal(0.0, 0.1, 5)
+    y[2] += 3.0
+    P, state, kept = np.eye(3), np.zeros(3), []
+    for row in range(5):
+        h, left = H[row], y[row] - H[row] @ state
+        S = h @ P @ h + noise[row]
+        if left**2 < 16.0 * S:
+            kept.append(row)
+            gain = P @ h / S
+            state, P = state + gain * left, P - np.outer(gain, h @ P)
+    assert within(y, H @ H.T + np.diag(noise)) == kept
+    assert len(kept) == 4
 
 
 def an_estimate(state: NetState) -> NetEstimate:

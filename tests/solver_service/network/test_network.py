@@ -32,9 +32,11 @@ def dive(seed: int, seconds: float, *, imu: bool = True, **scenario: Any) -> tup
     return world, [message for message in told if not isinstance(message, Truth | LightTruth | NodePose)]
 
 
-def solved(messages: list[Message], together: int = 2000, mode: str = "filter") -> tuple[list[NodePose], SolverCore]:
+def solved(
+    messages: list[Message], together: int = 2000, mode: str = "filter", hz: float = HZ
+) -> tuple[list[NodePose], SolverCore]:
     """Solve as a stored dive, so many messages at a time."""
-    core = SolverCore(SolveConfig().settings("test"), None, track=track_settings(mode, HZ))
+    core = SolverCore(SolveConfig().settings("test"), None, track=track_settings(mode, hz))
     found = []
     for start in range(0, len(messages), together):
         found += core.handle_many(messages[start : start + together])
@@ -94,6 +96,29 @@ def test_the_network_does_not_depend_on_how_much_comes_at_once(
     assert len(keyed) == len(once) > 20
     for one in once:
         assert keyed[one.node, one.stamp_ns].p_m == pytest.approx(one.p_m, abs=1e-6)
+
+
+def test_pictures_of_a_trigger_tell_together_what_they_tell_one_after_another(
+    four: tuple[World, list[Message], list[NodePose]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    messages = first_seconds(four[1], 3.0)
+    together = between_triggers(solved(messages, hz=20.0)[0])
+    monkeypatch.setattr(NetFilter, "_beside", lambda *_: [])
+    alone = between_triggers(solved(messages, hz=20.0)[0])
+    assert together.keys() == alone.keys()
+    off, ratios = [], []
+    for key, one in alone.items():
+        own, other = (np.trace(np.array(row.covariance).reshape(6, 6)[:3, :3]) for row in (one, together[key]))
+        off.append(np.linalg.norm(np.array(together[key].p_m) - one.p_m) / np.sqrt(own))
+        ratios.append(other / own)
+    assert np.median(off) < 0.15
+    assert max(off) < 0.6
+    assert np.median(ratios) == pytest.approx(1.0, abs=0.01)
+
+
+def between_triggers(poses: list[NodePose]) -> dict[tuple[str, int], NodePose]:
+    """The rows between two triggers, which count all pictures of the last one either way."""
+    return {(one.node, one.stamp_ns): one for one in poses if one.stamp_ns % (S_NS // 10)}
 
 
 def test_the_smoothed_network_is_better_than_the_filter_and_as_honest(
