@@ -65,7 +65,7 @@ class ClockAlignment:
         self._rows: deque[Floats] = deque()  # batches (4, N) of gap kind, slope, value, sd
         self._window: deque[_Sighting] = deque()
         self._next = 0  # index of the first fix in the window without a motion yet
-        self._moving: list[tuple[_Sighting, Floats]] = []  # with their rates (6,)
+        self._moving: list[tuple[_Sighting, list[_Sighting]]] = []  # with those that tell their motion
         self._rigs: tuple[Rig, Rig] | None = None
 
     def add(
@@ -87,9 +87,10 @@ class ClockAlignment:
         self._window.append(_Sighting(time_s, fix, known_s, sigma_rad))
         while self._window[self._next].time_s <= time_s - HALF_WINDOW_S:
             centre = self._window[self._next]
-            rates = self._rates(centre)
-            if rates is not None:
-                self._moving.append((centre, rates))
+            near = [one for one in self._window if abs(one.time_s - centre.time_s) <= HALF_WINDOW_S]
+            before = sum(one.time_s < centre.time_s for one in near)
+            if before >= MIN_NEIGHBOURS and len(near) - 1 - before >= MIN_NEIGHBOURS:
+                self._moving.append((centre, near))
             self._next += 1
             while self._window[0].time_s < self._window[self._next].time_s - HALF_WINDOW_S:
                 self._window.popleft()
@@ -97,26 +98,13 @@ class ClockAlignment:
         if len(self._moving) >= BATCH:
             self._make_equations()
 
-    def _rates(self, centre: _Sighting) -> Floats | None:
-        """Return velocity (m/s) and turn rate (rad/s) of T_a_b at a fix, (6,), from a cubic through its neighbours.
-
-        None if it has too few neighbours. With fewer than MIN_FOR_CUBIC fixes: from a straight line.
-        """
-        near = [s for s in self._window if abs(s.time_s - centre.time_s) <= HALF_WINDOW_S]
-        times_s = np.array([s.time_s - centre.time_s for s in near])
-        if (times_s < 0).sum() < MIN_NEIGHBOURS or (times_s > 0).sum() < MIN_NEIGHBOURS:
-            return None
-        moved = _poses(near).minus(centre.fix.T_a_b)
-        powers = times_s[:, None] ** np.arange(4 if len(near) >= MIN_FOR_CUBIC else 2)
-        return np.asarray(np.linalg.lstsq(powers, moved, rcond=None)[0][1])
-
     def _make_equations(self) -> None:
         """Turn the fixes with known motion into rows."""
         if not self._moving or self._rigs is None:
             return
         sightings = [sighting for sighting, _ in self._moving]
         T_a_b = _poses(sightings)
-        rates = np.array([rates for _, rates in self._moving])
+        rates = _rates(self._moving)
         self._moving.clear()
         expected, slopes, apart_rad = gap_slopes(T_a_b, rates, self._rigs)
         sigma_rad = np.array([s.sigma_rad for s in sightings]).T
@@ -151,6 +139,22 @@ class ClockAlignment:
             weight = np.minimum(1.0, HUBER * scale / np.maximum(off, 1e-12))
         sigma_s = scale * math.sqrt(float(np.linalg.inv(normal)[0, 0]))
         return ClockOffset(float(solution[0]), sigma_s, len(kind) // 2)
+
+
+def _rates(moving: Sequence[tuple[_Sighting, Sequence[_Sighting]]]) -> Floats:
+    """Return velocities (m/s) and turn rates (rad/s) of T_a_b at fixes, (N, 6), from cubics through their neighbours.
+
+    With fewer than MIN_FOR_CUBIC fixes: from a straight line.
+    """
+    counts = np.array([len(near) for _, near in moving])
+    told = np.arange(counts.max()) < counts[:, None]
+    times_s, moved = np.zeros(told.shape), np.zeros((*told.shape, 6))
+    times_s[told] = [one.time_s - centre.time_s for centre, near in moving for one in near]
+    centres = _poses([centre for centre, _ in moving])[np.repeat(np.arange(len(moving)), counts)]
+    moved[told] = _poses([one for _, near in moving for one in near]).minus(centres)
+    powers = times_s[:, :, None] ** np.arange(4) * told[:, :, None]
+    powers[counts < MIN_FOR_CUBIC, :, 2:] = 0.0
+    return np.asarray((np.linalg.pinv(powers) @ moved)[:, 1], np.float64)
 
 
 def gap_slopes(T_a_b: SE3, rates: Floats, rigs: tuple[Rig, Rig]) -> tuple[Floats, Floats, Floats]:
