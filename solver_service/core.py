@@ -257,8 +257,11 @@ class SolverCore:
         crowded, settled = self.is_crowded, []
         for pair in pairs:
             pair.crowd(alone=len(self.streams) == 2, crowded=crowded, one_in=self.pace.one_in)
-            settled.append((pair, pair.follow(told_ns)))
-        work_out_together([one.track for _, one in settled])
+            # Most messages are samples of sensors, which complete no trigger.
+            if pair.has_news:
+                settled.append((pair, pair.follow(told_ns)))
+        if settled:
+            work_out_together([one.track for _, one in settled])
         for pair, one in settled:
             messages += pair.told(one)
         if self.network is None:

@@ -112,6 +112,11 @@ class PairCore:
         """Match or reject the triggers whose waiting is over; everything: all of them."""
         self._unsettled += self.matcher.resolve(receive_ns, everything=everything)
 
+    @property
+    def has_news(self) -> bool:
+        """Whether there are triggers to settle."""
+        return bool(self._unsettled or self._settled)
+
     def settle(self, told_ns: int = -1) -> list[Message]:
         """Solve all matched triggers at once; return the outcomes in the order of the triggers, then the track.
 
@@ -121,7 +126,7 @@ class PairCore:
 
     def follow(self, told_ns: int = -1) -> Settled:
         """Settle, but for the track's messages, which may be worked out together with those of other pairs."""
-        if not (self._unsettled or self._settled):
+        if not self.has_news:
             return Settled()
         self._solve()
         settled, self._settled = self._settled, []
