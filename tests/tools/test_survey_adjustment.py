@@ -140,7 +140,11 @@ def test_a_baseline_finds_a_wrong_focal_length(seed):
     course = world.line(np.random.default_rng(seed), 12)
     course.stations_m[1] = course.stations_m[0] + (14.0, 14.28, 0.3)
     legs = world.readings_of(course, np.random.default_rng(seed), tape_m=0.01)
-    legs = [replace(leg, distance_m=leg.distance_m * 1.005) for leg in legs]
+    # A leg's stated sd holds the scale's as well.
+    legs = [
+        replace(leg, distance_m=leg.distance_m * 1.005, distance_sigma_m=math.hypot(0.01, 0.0015 * leg.distance_m))
+        for leg in legs
+    ]
     base_m = float(np.linalg.norm(course.stations_m[1] - course.stations_m[0]))
     known = [Known(from_="0", to="1", distance_m=base_m, sigma_m=0.002)]
     unknown = adjust(world.project_of(legs)).solution.unknown("scale of a and b")
@@ -161,6 +165,18 @@ def test_two_fixed_points_find_a_wrong_focal_length(seed):
     fix = [FixedPoint(station=n, east_m=e[0], north_m=e[1]) for n, e in zip(("0", "12"), ends, strict=True)]
     fixed = adjust(world.project_of(legs, fix=fix, place=Place(declination_deg=0.0)))
     assert fixed.solution.unknown("scale of a and b")[0] == pytest.approx(0.005, abs=0.001)
+
+
+def test_exact_readings_and_two_fixed_points_give_the_scale_itself():
+    course = world.line(np.random.default_rng(4), 12)
+    legs = world.readings_of(course, np.random.default_rng(4), compass_deg=0.0, tape_m=0.0, depth_m=0.0)
+    legs = [replace(leg, distance_m=leg.distance_m * 1.005, distance_sigma_m=0.02) for leg in legs]
+    ends = [world.enu(course.stations_m[k]) for k in (0, 12)]
+    fix = [FixedPoint(station=n, east_m=e[0], north_m=e[1]) for n, e in zip(("0", "12"), ends, strict=True)]
+    scale, sigma = adjust(world.project_of(legs, fix=fix)).solution.unknown("scale of a and b")
+    # What was known of it before is freed, so that it pulls no more.
+    assert sigma < 0.0015 / 2
+    assert scale == pytest.approx(0.005, abs=2e-5)
 
 
 def test_a_sparse_inverse_is_the_dense_one(monkeypatch):

@@ -233,7 +233,8 @@ def assemble(
             name = scale_name(leg)
             if of.has(name) is None:
                 # Known lines or fixed points may tell the scale better than the calibration does.
-                of.loosen[len(of.value)] = of.unknown(name, share), SCALE_FREE
+                beforehand = len(of.value)
+                of.loosen[beforehand] = of.unknown(name, share), SCALE_FREE
             terms = [(of.unknown(name), 1.0)]
         to.observations.rows[number, "distance"] = of.add(
             "distance", start, end, leg.distance_m, sigma_m, terms, leg=number, what="distance"
