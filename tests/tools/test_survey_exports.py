@@ -37,13 +37,14 @@ def on_grid(latitude_deg, longitude_deg, **grid):
     }
 
 
-# Both edges of a zone, where grid north is up to 2.6 degrees off; both hemispheres; national grids of four kinds.
+# Both edges of a zone, where grid north is up to 2.6 degrees off; both hemispheres; national grids of five kinds.
 GRIDS = {
     "utm": on_grid(45.5, 9.2, utm_zone="32N"),
     "utm_west": on_grid(60.1, 6.02, utm_zone="32N"),
     "utm_east": on_grid(60.1, 11.98, utm_zone="32N"),
     "utm_south": on_grid(-33.2, 149.9, utm_zone="55S"),
     "lambert": on_grid(44.3, 1.6, epsg=2154),
+    "lambert_paris": on_grid(45.5, 4.9, epsg=27572),
     "swiss": on_grid(46.9, 7.1, epsg=2056),
     "british": on_grid(54.1, -2.4, epsg=27700),
     "krovak": on_grid(49.4, 16.7, epsg=5514),

@@ -5,6 +5,7 @@ from datetime import date
 
 import numpy as np
 import pytest
+from buddyline.protocol.config import ConfigError
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.survey.geodesy import Projection, declination, grid_of, radii_m, utm_epsg
 from buddyline.tools.survey.lines import bearing_of, line_of, measures_of
@@ -243,17 +244,27 @@ def test_a_leg_has_the_declination_of_its_own_date():
     assert len({line.turn_rad for line in adjust(stated).lines}) == 1
 
 
-def test_a_map_grid_s_scale_counts_for_latitude_and_longitude():
+# UTM; meridians counted from Paris; angles not kept; axes of a datum that PROJ reaches on several ways.
+@pytest.mark.parametrize(
+    ("epsg", "latitude_deg", "longitude_deg"),
+    [(32632, 45.5, 9.0), (27572, 45.5, 4.9), (3035, 42.5, 20.0), (5514, 49.3, 16.7)],
+)
+def test_a_map_grid_s_north_and_scale_are_taken_off_latitude_and_longitude(epsg, latitude_deg, longitude_deg):
     legs = world.readings_of(world.line(np.random.default_rng(4), 40), np.random.default_rng(1))
-    place = Place(declination_deg=0.0, utm_zone="32N", latitude_deg=45.5, longitude_deg=9.0)
-    fix = [FixedPoint(station="0", latitude_deg=45.5, longitude_deg=9.0)]
-    utm = adjust(world.project_of(legs, place=place, fix=fix))
+    where = {"latitude_deg": latitude_deg, "longitude_deg": longitude_deg}
+    fix = [FixedPoint(station="0", **where)]
+    on_map = adjust(world.project_of(legs, place=Place(declination_deg=0.0, epsg=epsg, **where), fix=fix))
     local = adjust(world.project_of(legs, place=Place(declination_deg=0.0), fix=fix))
-    far = max(
-        utm.positions.values(),
-        key=lambda one: float(np.linalg.norm(one.position_m[:2] - utm.positions["0"].position_m[:2])),
-    )
-    same, other = utm.grid.degrees(far.position_m), local.grid.degrees(local.positions[far.name].position_m)
-    # At the central meridian the grid is 0.04 % too small: 4 cm of a hundred metres.
-    apart_m = np.radians(np.subtract(same, other)) * np.array(radii_m(45.5))[::-1]
+    start_m = on_map.positions["0"].position_m
+    far = max(on_map.positions.values(), key=lambda one: float(np.linalg.norm((one.position_m - start_m)[:2])))
+    assert np.linalg.norm((far.position_m - start_m)[:2]) > 90.0
+    same, other = on_map.grid.degrees(far.position_m), local.grid.degrees(local.positions[far.name].position_m)
+    # At its central meridian UTM is 0.04 % too small: 4 cm of a hundred metres.
+    apart_m = np.radians(np.subtract(same, other)) * np.array(radii_m(latitude_deg))[::-1]
     assert np.linalg.norm(apart_m) < 0.01
+
+
+@pytest.mark.parametrize("epsg", [2053, 5513])
+def test_a_map_grid_to_south_and_west_is_refused(epsg):
+    with pytest.raises(ConfigError, match=f"place.epsg {epsg}: .* has axes to .*west.*: name a grid to east and north"):
+        Projection(epsg).metres(-26.5, 28.5)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from datetime import UTC, date, datetime
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.errors import BuddylineError
@@ -16,7 +17,7 @@ from buddyline.tools.survey.project import FixedPoint, Leg, Project
 from msgspec import UNSET
 
 if TYPE_CHECKING:
-    from pyproj import Proj, Transformer
+    from pyproj import Transformer
 
 # WGS 84.
 SEMI_MAJOR_M: Final = 6378137.0
@@ -24,6 +25,8 @@ FLATTENING: Final = 1 / 298.257223563
 _E2: Final = FLATTENING * (2 - FLATTENING)
 # Places are rounded to this for the World Magnetic Model: to a kilometre, in which it changes by 0.01 degrees.
 MODEL_DIGITS: Final = 2
+# Half the way by which a grid's north and scale are found.
+STEP_M: Final = 10.0
 
 
 @dataclass(frozen=True)
@@ -46,13 +49,11 @@ class Projection:
         units = {axis.unit_name for axis in crs.axis_info}
         if not crs.is_projected or units != {"metre"}:
             raise ConfigError(f"place.epsg {self.epsg}: {crs.name} is no map grid in metres")
+        # Around a pole both axes point the same way.
+        if "west" in (directions := [axis.direction for axis in crs.axis_info]):
+            where = " and ".join(directions)
+            raise ConfigError(f"place.epsg {self.epsg}: {crs.name} has axes to {where}: name a grid to east and north")
         return Transformer.from_crs("EPSG:4326", crs, always_xy=True)
-
-    @cached_property
-    def _proj(self) -> Proj:
-        from pyproj import Proj
-
-        return Proj(self._transformer.target_crs)
 
     def metres(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
         """Return east and north, metres, of a place of WGS 84; raise BuddylineError outside of the grid."""
@@ -63,18 +64,42 @@ class Projection:
 
     def degrees(self, east_m: float, north_m: float) -> tuple[float, float]:
         """Return latitude and longitude, WGS 84; raise BuddylineError outside of the grid."""
-        longitude_deg, latitude_deg = self._transformer.transform(east_m, north_m, direction="INVERSE")
+        back = partial(self._transformer.transform, direction="INVERSE")
+        # PROJ may take another operation on the way back: what it errs by is taken off.
+        there_m = self._transformer.transform(*back(east_m, north_m))
+        longitude_deg, latitude_deg = back(2 * east_m - there_m[0], 2 * north_m - there_m[1])
         if not math.isfinite(longitude_deg + latitude_deg):
             raise BuddylineError(f"east {east_m} m, north {north_m} m: outside of EPSG:{self.epsg}")
         return latitude_deg, longitude_deg
 
     def convergence_rad(self, latitude_deg: float, longitude_deg: float) -> float:
         """Return the azimuth of grid north, east of true north positive."""
-        return math.radians(self._proj.get_factors(longitude_deg, latitude_deg).meridian_convergence)
+        return convergence_rad(self._transformer, latitude_deg, longitude_deg)
 
-    def scale(self, latitude_deg: float, longitude_deg: float) -> float:
-        """Return metres in the grid per metre on the ground, at the ellipsoid, along the meridian."""
-        return float(self._proj.get_factors(longitude_deg, latitude_deg).meridional_scale)
+    def stretch(self, latitude_deg: float, longitude_deg: float) -> Floats:
+        """Return how the grid deforms what is turned to its north, (2, 2): a scale alone, where it keeps angles."""
+        angle = self.convergence_rad(latitude_deg, longitude_deg)
+        turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+        return np.column_stack([_on_map(self._transformer, latitude_deg, longitude_deg, *axis) for axis in turn.T])
+
+
+def convergence_rad(to_map: Transformer, latitude_deg: float, longitude_deg: float) -> float:
+    """Return the azimuth of grid north, east of true north positive, by the grid's own coordinates.
+
+    PROJ's factors err where the meridians of a grid are not counted from Greenwich.
+    """
+    east, north = _on_map(to_map, latitude_deg, longitude_deg, 0.0, 1.0)
+    return -math.atan2(east, north)
+
+
+def _on_map(to_map: Transformer, latitude_deg: float, longitude_deg: float, east: float, north: float) -> Floats:
+    """Return the way on the map (2,) of a metre on the ellipsoid, by the place before and behind."""
+    per_longitude_m, per_latitude_m = radii_m(latitude_deg)
+    longer_deg, further_deg = (math.degrees(STEP_M * part) for part in (east / per_longitude_m, north / per_latitude_m))
+    ahead, behind = (
+        to_map.transform(longitude_deg + sign * longer_deg, latitude_deg + sign * further_deg) for sign in (1, -1)
+    )
+    return np.subtract(ahead, behind) / (2 * STEP_M)
 
 
 def utm_epsg(zone: str) -> int:
@@ -220,9 +245,8 @@ class Grid:
         """Return latitude and longitude of a position (east, north, ...); None if no place is known."""
         east_m, north_m = float(position_m[0]), float(position_m[1])
         if self.projection is not None:
-            scale = self._scale
-            away_m = (east_m - self.anchor_m[0]) * scale, (north_m - self.anchor_m[1]) * scale
-            return self.projection.degrees(self.anchor_m[0] + away_m[0], self.anchor_m[1] + away_m[1])
+            at_m = self._stretch @ np.subtract((east_m, north_m), self.anchor_m) + self.anchor_m
+            return self.projection.degrees(*at_m.tolist())
         if self.origin is None:
             return None
         per_longitude_m, per_latitude_m = radii_m(self.origin[0])
@@ -232,9 +256,9 @@ class Grid:
         )
 
     @cached_property
-    def _scale(self) -> float:
+    def _stretch(self) -> Floats:
         assert self.projection is not None
-        return self.projection.scale(*self.projection.degrees(*self.anchor_m))
+        return self.projection.stretch(*self.projection.degrees(*self.anchor_m))
 
     def position_m(self, fix: FixedPoint) -> tuple[float, float]:
         """Return east and north of a fixed point."""

@@ -41,7 +41,7 @@ class About(Config, frozen=True, kw_only=True):
 class Place(Config, frozen=True, kw_only=True):
     """[place]: where the dive is, for the declination; water_level_m: altitude of the surface, where depth
     is 0; by default from the first fix's altitude and its station's depth, or 0. utm_zone ("32N") or epsg (any
-    projected coordinate system in metres, such as 2154): the map grid of all coordinates."""
+    projected coordinate system in metres to east and north, such as 2154): the map grid of all coordinates."""
 
     latitude_deg: Annotated[float, Meta(ge=-90, le=90)] | UnsetType = UNSET
     longitude_deg: Annotated[float, Meta(ge=-180, le=180)] | UnsetType = UNSET

@@ -8,6 +8,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
 from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.survey.geodesy import convergence_rad
 from buddyline.tools.survey.old.model import OldFix, OldSurvey
 
 if TYPE_CHECKING:
@@ -79,7 +80,8 @@ def convergence_deg(survey: OldSurvey, system: str = "") -> float:
     known = next((fix for fix in survey.fixes if fix.system), None)
     if not system or known is None or not crs_of(system).is_projected:
         return 0.0
-    from pyproj import Proj
+    from pyproj import Transformer
 
     longitude_deg, latitude_deg = known.position[:2] if known.system == DEGREES else moved(known, DEGREES)
-    return float(Proj(crs_of(system)).get_factors(longitude_deg, latitude_deg).meridian_convergence)
+    to_map = Transformer.from_crs("EPSG:4326", crs_of(system), always_xy=True)
+    return math.degrees(convergence_rad(to_map, latitude_deg, longitude_deg))
