@@ -71,6 +71,24 @@ def test_a_misnamed_station_is_named_first_and_with_its_true_name(seed):
     assert named_first(seed) == (True, True)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_a_misnamed_station_is_told_from_the_one_joint_of_two_loops(seed):
+    """Either, elsewhere, would let all close; the water level of the second dive would be metres off."""
+    rng = np.random.default_rng(seed)
+    first, second = world.loop(rng, 14), world.loop(rng, 12)
+    second.stations_m = second.stations_m + first.stations_m[4] - second.stations_m[0] + (40.0, 10.0, 3.0)
+    places = np.vstack([first.stations_m, second.stations_m])
+    legs = [*first.legs, (4, 14, 0), *((14 + i, 14 + j, (k + 1) % 2) for k, (i, j, _) in enumerate(second.legs))]
+    course = world.SurveyCourse(places, legs, [str(k) for k in range(len(places))])
+    read = world.readings_of(course, rng, compass_deg=1.5)
+    read = [replace(leg, dive=1 + (k >= len(first.legs))) for k, leg in enumerate(read)]
+    wrong = str(7 + seed)
+    at = len(first.legs) + 4
+    read[at], read[at + 1] = replace(read[at], to=wrong), replace(read[at + 1], from_=wrong)
+    found = adjust(world.project_of(read)).blunders
+    assert found[0].cause == f"station name: {wrong} of {read[at].name} and {read[at + 1].name}: it is another place"
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_nearly_all_misnamed_stations_are_named_first():
@@ -239,6 +257,16 @@ def test_a_network_of_distances_alone_keeps_its_shape():
     sizes = [sum(p.ellipse[0] ** 2 for p in one.positions.values()) for one in (adjusted, start)]
     # Inner constraints have the least trace.
     assert sizes[0] < sizes[1]
+
+
+@pytest.mark.parametrize("dense", [0, 1500])
+def test_legs_that_no_gyroscope_ties_to_a_known_azimuth_are_refused_in_words(monkeypatch, dense):
+    pytest.importorskip("scipy")
+    monkeypatch.setattr(normal, "DENSE", dense)
+    legs = world.readings_of(world.line(np.random.default_rng(1), 6), np.random.default_rng(1))
+    known = [Known(from_="0", to="1", azimuth_deg=20.0, azimuth_sigma_deg=0.1)]
+    with pytest.raises(BuddylineError, match="stations that its observations do not fix"):
+        adjust(replace(world.project_of(legs, known=known), adjust=AdjustSettings(compass="ignore")))
 
 
 def test_an_unchecked_leg_has_no_detectable_error_and_the_report_says_the_global_test():

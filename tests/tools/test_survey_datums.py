@@ -91,6 +91,16 @@ def test_a_misread_tape_is_named_and_stands_out_in_the_residuals(tmp_path):
     assert sum(float(row["redundancy"]) for row in rows) == pytest.approx(adjusted.fit.freedom, abs=0.01)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_a_tape_misread_by_a_metre_is_named_first(tmp_path, seed):
+    _, depths, tapes = site(seed)
+    i, j = PAIRS[seed * 5 % 15]
+    tapes[i, j] += 1.0
+    blunders = adjusted_of(tmp_path, depths, tapes).blunders
+    assert [one.cause for one in blunders] == [f"leg {i}-{j}: distance"]
+    assert blunders[0].off == pytest.approx(1.0, abs=0.15)
+
+
 def test_a_free_network_has_no_datum_point_that_is_exact(tmp_path):
     _, depths, tapes = site(1)
     adjusted = adjusted_of(tmp_path, depths, tapes)

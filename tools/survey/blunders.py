@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import NormalDist
 from typing import Final
 
 import numpy as np
+from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.survey.connected import Change, Survey
 from buddyline.tools.survey.observations import ANGLES, CHECKED, DISTANCE, Solution
 
@@ -30,10 +31,11 @@ TOLD_SHARE: Final = 0.1
 # An explanation is listed with the best one if it explains this share as much.
 AS_GOOD: Final = 0.8
 MOST_OTHERS: Final = 4
-# Explanations whose chi^2 differs by less than this, or by this share, are the same; so many are tried.
+# Suspicions whose first step explains this share of what the best one's does are tried, so many at most; what leaves
+# chi^2 within this is the same.
+LIKELY_SHARE: Final = 0.6
+TRIED: Final = 8
 TIED: Final = 6.0
-TIED_SHARE: Final = 0.01
-TRIED: Final = 6
 # Chi^2 of 3 degrees of freedom that one sound identity in a thousand exceeds; and places looked at for it.
 SAME_CHI2: Final = 16.27
 PLACES_TRIED: Final = 3
@@ -111,21 +113,22 @@ def find_blunders(survey: Survey) -> list[Blunder]:
     solution = survey.adjust(linear=True)
     while len(found) < MOST_BLUNDERS:
         suspects = sorted(_suspects(survey, solution, taken), key=lambda one: -one.score)
-        if not suspects:
+        best_score = suspects[0].score if suspects else 0.0
+        # The scores are of a first step; which suspicion explains most is seen in the adjustment without it.
+        likely = [one for one in suspects if one.score >= LIKELY_SHARE * best_score][:TRIED]
+        trials = [trial for one in likely if (trial := _tried(survey, taken, one)) is not None]
+        if not trials:
             break
-        best_score = suspects[0].score
-        tied = [one for one in suspects if one.score >= best_score - max(TIED, TIED_SHARE * best_score)][:TRIED]
-        if suspects[0].visit:
+        noise = max(min(one.after.chi2 / max(one.after.freedom, 1) for one in trials), 1.0)
+        costs = [one.after.chi2 / noise + NAME_COST * bool(one.suspect.visit) for one in trials]
+        named = trials[int(np.argmin(costs))]
+        if named.suspect.visit:
+            tied = [one for one, cost in zip(trials, costs, strict=True) if cost <= min(costs) + TIED]
             # Which of a name's two stays is the wrong one shows where the other place has a name; else the later one.
-            judged = [_identified(survey, taken, one) for one in tied if one.visit]
+            judged = [_identified(survey, taken, one) for one in tied if one.suspect.visit]
             by_time = sorted(judged, key=lambda one: -survey.legs[one.suspect.visit[0][0]].start_ns)
             named = next((one for one in judged if one.same), by_time[0])
-            best, change, cause, after = named.suspect, named.change, named.cause, named.after
-            off, unit = math.nan, "m"
-        else:
-            best, change, cause = suspects[0], suspects[0].change, suspects[0].cause
-            after = survey.adjust(taken.with_(change), linear=True)
-            off, unit = _size(solution, after, best)
+        best, after = named.suspect, named.after
         # Another name explains what a single reading does, and more: it is no alternative to it.
         as_good = [
             one
@@ -134,8 +137,9 @@ def find_blunders(survey: Survey) -> list[Blunder]:
         ]
         legs = dict.fromkeys(name for one in (best, *as_good) for name in one.legs)
         others = tuple(dict.fromkeys(one.cause for one in as_good))[:MOST_OTHERS]
-        found.append(Blunder(cause, tuple(legs), off, unit, solution.chi2 - after.chi2, others))
-        taken, solution = taken.with_(change), after
+        off, unit = _size(solution, after, best)
+        found.append(Blunder(named.cause, tuple(legs), off, unit, solution.chi2 - after.chi2, others))
+        taken, solution = taken.with_(named.change), after
     return found
 
 
@@ -230,17 +234,28 @@ def _size(solution: Solution, after: Solution, suspect: _Suspect) -> tuple[float
 
 
 @dataclass(frozen=True)
-class _Identified:
+class _Trial:
+    """A suspicion and the adjustment after it. same: the other place of a misnamed station has a name."""
+
     suspect: _Suspect
     change: Change
     cause: str
     after: Solution
-    same: bool
+    same: bool = False
 
 
-def _identified(survey: Survey, taken: Change, suspect: _Suspect) -> _Identified:
-    """Try a stay at a misnamed station: return the station that its place is, if it has a name already."""
-    after = survey.adjust(taken.with_(suspect.change), linear=True)
+def _tried(survey: Survey, taken: Change, suspect: _Suspect) -> _Trial | None:
+    """Try a suspicion; None where it leaves stations that nothing else holds: then it explains anything."""
+    try:
+        after = survey.adjust(taken.with_(suspect.change), linear=True)
+    except BuddylineError:
+        return None
+    return _Trial(suspect, suspect.change, suspect.cause, after)
+
+
+def _identified(survey: Survey, taken: Change, trial: _Trial) -> _Trial:
+    """Return the station that the place of a stay at a misnamed one is, if it has a name already."""
+    suspect, after = trial.suspect, trial.after
     new = next(iter(suspect.change.names.values()))
     i, names = after.observations.at[new], after.observations.stations
     away_m = np.linalg.norm(after.position_m - after.position_m[i], axis=1)
@@ -251,5 +266,5 @@ def _identified(survey: Survey, taken: Change, suspect: _Suspect) -> _Identified
         change = Change(names=dict.fromkeys(suspect.visit, name))
         joined = survey.adjust(taken.with_(change), linear=True)
         if joined.chi2 - after.chi2 < SAME_CHI2:
-            return _Identified(suspect, change, f"{suspect.cause}: it is {name}", joined, same=True)
-    return _Identified(suspect, suspect.change, f"{suspect.cause}: it is another place", after, same=False)
+            return _Trial(suspect, change, f"{suspect.cause}: it is {name}", joined, same=True)
+    return replace(trial, cause=f"{suspect.cause}: it is another place")

@@ -169,9 +169,10 @@ class Survey:
             steps = list(map(step_m_of, legs, self.turns_rad))
             first_m = place_all(self.project, legs, ends, steps, self._starts())[0]
         names = list(dict.fromkeys([*(name for name in self.fixed if name in first_m), *(n for e in ends for n in e)]))
-        if not set(names) <= set(first_m):
-            # Without the observation a station hangs on nothing; as before it is a place to begin with.
-            first_m = self.first_m | first_m
+        # Without the observation a station hangs on nothing; as before it is a place to begin with.
+        first_m = self.first_m | first_m
+        if lost := set(names) - set(first_m):
+            raise BuddylineError(f"station {min(lost)} hangs on nothing")
         of = assemble(
             self.project,
             self.legs,

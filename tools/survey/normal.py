@@ -45,6 +45,7 @@ class Normal:
                 A = np.zeros((len(weights), count))
                 np.add.at(A, (rows, columns), scaled)
                 self._dense = A.T @ A
+                np.linalg.cholesky(self._dense)
             else:
                 self._factor(rows, columns, scaled, blocks)
         except (np.linalg.LinAlgError, RuntimeError) as error:

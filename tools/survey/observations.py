@@ -29,7 +29,7 @@ WORSE: Final = 1.05
 # A compass this many sd off counts a quarter (Geman and McClure 1987): some are disturbed, by any angle.
 FAR_SIGMAS: Final = 2.5
 # An error is checked where at least this share of it shows.
-CHECKED: Final = 1e-3
+CHECKED: Final = 1e-5
 # A leg that ends this share of its length away from where it reads is taken as it reads.
 GROSS_SHARE: Final = 0.3
 LEAST_RUN_M: Final = 1e-3
@@ -125,14 +125,15 @@ class Observations:
     def adjust(self, stations_m: Floats, *, linear: bool = False) -> Solution:
         """Return the least squares solution, searched from stations_m (s, 3); raise BuddylineError if there is none.
 
-        linear: with the derivatives at each leg's readings alone, where blunders of any size cannot lead astray.
+        linear: with the derivatives at each leg's readings, where blunders of any size cannot lead astray; lines that
+        are read without a direction have them at their places.
         """
         model = Model(self)
         x = np.concatenate([stations_m.ravel(), self.start_values])
         normal = None
         misfit, at, values = model.linear(x)
-        for number in range(1 if linear else MOST_ITERATIONS):
-            weights = model.weights(misfit) if number else model.sigma**-2
+        for number in range(MOST_ITERATIONS):
+            weights = model.weights(misfit) if number and not linear else model.sigma**-2
             normal = Normal(at, values, weights, model.blocks, normal)
             step = normal.solve(np.bincount(at[1], values * (weights * misfit)[at[0]], len(x)).astype(float))
             chi2 = float(weights @ misfit**2)
@@ -145,11 +146,13 @@ class Observations:
             if number and np.abs(step).max() < SETTLED:
                 break
             if not number:
-                for row, (column, freed) in self.loosen.items():
-                    unit = np.zeros(len(x))
-                    unit[column] = 1.0
-                    if normal.solve(unit)[column] < KNOWN_SHARE * model.sigma[row] ** 2:
-                        model.sigma[row] = freed
+                freed = [
+                    row for row, (column, _) in self.loosen.items() if self._is_told(normal, column, model.sigma[row])
+                ]
+                for row in freed:
+                    model.sigma[row] = self.loosen[row][1]
+                if linear and model.by_reading.all() and not freed:
+                    break
                 if not linear:
                     model.turn_to(x)
                     misfit, at, values = model.linear(x)
@@ -159,6 +162,12 @@ class Observations:
         if normal is None or (model.robust.any() and not linear):
             normal = Normal(at, values, weights, model.blocks, normal)
         return Solution(self, model, x, misfit, at, values, weights, normal)
+
+    def _is_told(self, normal: Normal, column: int, sigma: float) -> bool:
+        """Tell whether the other observations know an unknown better than its sd beforehand."""
+        unit = np.zeros(self.count)
+        unit[column] = 1.0
+        return bool(normal.solve(unit)[column] < KNOWN_SHARE * sigma**2)
 
 
 class Model:
