@@ -109,8 +109,47 @@ def test_hand_written_text_stays_and_the_old_file_is_kept(tmp_path, logs):
     for leg in load_project(path).leg:
         assert leg.distance_m == before[leg.name].distance_m
         assert leg.distance_sigma_m > before[leg.name].distance_sigma_m
-    # The leg that was taken out leaves the others without a connection.
-    assert run("adjust", path) == 1
+    # The others go on without the leg that was taken out.
+    assert run("adjust", path) == 0
+
+
+@pytest.mark.parametrize(
+    "change", ['[[equate]]\nstations = ["entry", "2"]\n', '[[mark]]\nnode = "b"\nseconds = 30.0\nname = "TIP"\n']
+)
+def test_what_legs_has_not_taken_in_yet_is_said(tmp_path, logs, capsys, change):
+    path = tmp_path / "cave.toml"
+    run("legs", path, "--dive", *logs)
+    assert run("adjust", path) == 0
+    path.write_text(path.read_text().replace(MARKER, f"{change}\n{MARKER}"))
+    said = "dives, marks or equates have changed since `buddyline survey legs` made its legs: run it again"
+    for words in (["adjust", path], ["export", path, "--format", "csv"]):
+        capsys.readouterr()
+        assert run(*words) == 1
+        assert said in capsys.readouterr().err
+    run("legs", path)
+    capsys.readouterr()
+    run("adjust", path)
+    assert not capsys.readouterr().err
+
+
+def test_depth_by_option_leaves_the_other_settings_of_the_adjustment(tmp_path, logs, capsys):
+    path = tmp_path / "cave.toml"
+    run("legs", path, "--dive", *logs)
+    path.write_text(path.read_text().replace(MARKER, f'[adjust]\ndatum = "free"\n\n{MARKER}'))
+    for words in ([], ["--depth", "readings"], ["--depth", "absolute"]):
+        capsys.readouterr()
+        assert run("adjust", path, "--json", *words) == 0
+        stations = json.loads(capsys.readouterr().out)["stations"]
+        assert stations["entry"]["ellipse"][0] > 0.02
+
+
+def test_a_station_that_is_fixed_twice_is_refused(tmp_path, logs):
+    path = tmp_path / "cave.toml"
+    run("legs", path, "--dive", *logs)
+    fixes = "".join(f'[[fix]]\nstation = "entry"\neast_m = {east}\nnorth_m = 0\n' for east in (0, 100))
+    path.write_text(path.read_text().replace(MARKER, f"{fixes}\n{MARKER}"))
+    with pytest.raises(ConfigError, match="fix of 'entry': is stated twice"):
+        run("adjust", path)
 
 
 def test_a_better_calibration_updates_the_survey(tmp_path, logs, messages):

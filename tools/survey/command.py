@@ -156,7 +156,7 @@ def _legs(args: argparse.Namespace) -> int:
     from buddyline.tools.survey.derive import Derived
     from buddyline.tools.survey.gauges import adjust_gauges
     from buddyline.tools.survey.marks import of_project, of_table
-    from buddyline.tools.survey.project import load_project, new_project, write_derived
+    from buddyline.tools.survey.project import Made, load_project, new_project, own_equates, sources_of, write_derived
     from buddyline.tools.survey.readings import of_logs
 
     path: Path = args.project
@@ -171,10 +171,8 @@ def _legs(args: argparse.Namespace) -> int:
         pairs = of_logs([str(path.parent / log) for log in one.logs])
         by_hand = of_project(marks, number, int(pairs[0].stamps_ns[0]))
         derived.add(pairs, project.settings, project.alarms, number, by_hand)
-    for one_place in project.equate:
-        # Names with points are those of old surveys, which are joined when all is adjusted.
-        if len(ours := [name for name in one_place.stations if "." not in name]) > 1:
-            derived.equate(ours)
+    for same in own_equates(project):
+        derived.equate(same)
     gauges = adjust_gauges(derived.legs, project.alarms)
     stations = derived.stations(gauges.depths)
     for text in gauges.alarms:
@@ -186,6 +184,7 @@ def _legs(args: argparse.Namespace) -> int:
     write_derived(
         path,
         {
+            "made": [Made(of=sources_of(project))],
             "problem": derived.problems,
             "station": stations,
             "leg": derived.legs,
@@ -233,7 +232,7 @@ def _sheet(args: argparse.Namespace) -> Sheet:
     """Return the project's survey, adjusted."""
     from buddyline.tools.survey.network import adjust
     from buddyline.tools.survey.old.joining import joined, read_project_files
-    from buddyline.tools.survey.project import AdjustSettings, load_project
+    from buddyline.tools.survey.project import load_project
     from buddyline.tools.survey.sheet import Sheet
     from msgspec.structs import replace
 
@@ -241,12 +240,12 @@ def _sheet(args: argparse.Namespace) -> Sheet:
     olds = read_project_files(project, args.project.parent)
     project = joined(project, olds)
     if args.depth:
-        project = replace(project, adjust=AdjustSettings(depth=args.depth))
+        project = replace(project, adjust=replace(project.adjust, depth=args.depth))
     return Sheet(project, adjust(project), olds)
 
 
 def _adjust(args: argparse.Namespace) -> int:
-    """Print the adjustment; return 1 if it finds a blunder or leaves out a leg that nobody has taken out."""
+    """Print the adjustment; return 1 if it finds a blunder, leaves out a leg that nobody has taken out, or is stale."""
     from buddyline.tools.survey import report
 
     sheet = _sheet(args)
@@ -256,7 +255,18 @@ def _adjust(args: argparse.Namespace) -> int:
         print("\n".join(report.summary(sheet)))
     taken_out = {id(leg) for leg in sheet.project.leg + sheet.project.point if sheet.project.taken_out(leg)}
     lost = [leg for leg, _ in sheet.adjusted.left_out if id(leg) not in taken_out]
-    return 1 if sheet.adjusted.blunders or lost else 0
+    return 1 if _is_stale(args, sheet) or sheet.adjusted.blunders or lost else 0
+
+
+def _is_stale(args: argparse.Namespace, sheet: Sheet) -> bool:
+    """Tell, and say, whether what the legs are made of has changed since."""
+    from buddyline.tools.survey.project import sources_of
+
+    if not sheet.project.made or sheet.project.made[0].of == sources_of(sheet.project):
+        return False
+    changed = "dives, marks or equates have changed since `buddyline survey legs` made its legs: run it again"
+    print(f"{args.project}: {changed}", file=sys.stderr)
+    return True
 
 
 def _report(args: argparse.Namespace) -> int:
@@ -268,7 +278,7 @@ def _report(args: argparse.Namespace) -> int:
 
 
 def _export(args: argparse.Namespace) -> int:
-    """Write the survey in one of FORMATS; return 1 where the format leaves old surveys out."""
+    """Write the survey in one of FORMATS; return 1 where the format leaves old surveys out, or the legs are stale."""
     from buddyline.tools.newfile import write_output
 
     if args.style not in STYLES.get(args.format, ("auto",)):
@@ -280,7 +290,7 @@ def _export(args: argparse.Namespace) -> int:
     if sheet.olds and args.format == "dat":
         print(f"{args.project}: left out: old surveys, which dat has not; svx and th have them", file=sys.stderr)
         return 1
-    return 0
+    return int(_is_stale(args, sheet))
 
 
 def exported(sheet: Sheet, kind: str, style: str = "auto") -> str | bytes:

@@ -6,6 +6,7 @@ never change. A copy of the file before each change is kept beside it.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -60,8 +61,8 @@ class Place(Config, frozen=True, kw_only=True):
 class FixedPoint(Config, frozen=True, kw_only=True):
     """[[fix]]: a station known from elsewhere, in metres (UTM where the place names a zone) or in degrees.
 
-    altitude_m: by default from the station's depth. sigma_m: 1 sd of east and of north, altitude_sigma_m: of the
-    altitude; 0 for exact.
+    altitude_m: by default from the station's depth; both count, where the water level is stated as well. sigma_m: 1
+    sd of east and of north, altitude_sigma_m: of the altitude; 0 for exact.
     """
 
     station: str
@@ -249,6 +250,12 @@ class Station(Config, frozen=True, kw_only=True):
     notes: list[str] = field(default_factory=list)
 
 
+class Made(Config, frozen=True, kw_only=True):
+    """[[made]]: a hash of what the lower part was made of: dives, marks and equates."""
+
+    of: str
+
+
 class Problem(Config, frozen=True, kw_only=True):
     """[[problem]]: a question that the logs leave open, in words."""
 
@@ -270,6 +277,7 @@ class Project(Config, frozen=True, kw_only=True):
     alarms: AlarmSettings = field(default_factory=AlarmSettings)
     known: list[Known] = field(default_factory=list)
     adjust: AdjustSettings = field(default_factory=AdjustSettings)
+    made: list[Made] = field(default_factory=list)
     leg: list[Leg] = field(default_factory=list)
     point: list[Leg] = field(default_factory=list)
     turn: list[Turn] = field(default_factory=list)
@@ -301,12 +309,27 @@ def load_project(path: Path | str) -> Project:
             raise ConfigError(
                 f"{path}: fix of {fix.station!r}: give east_m and north_m, or latitude_deg and longitude_deg"
             )
+    fixed = [fix.station for fix in project.fix]
+    if twice := {name for name in fixed if fixed.count(name) > 1}:
+        raise ConfigError(f"{path}: fix of {min(twice)!r}: is stated twice; give one place, or their mean")
     names = {leg.name for leg in project.leg}
     for edit in project.edit:
         # The legs of old surveys are read later.
         if names and edit.leg not in names and not project.old:
             raise ConfigError(f"{path}: edit of leg {edit.leg!r}: no such leg; known: {', '.join(sorted(names))}")
     return project
+
+
+def own_equates(project: Project) -> list[list[str]]:
+    """Return the dives' stations that are one place. Those of old surveys, with points, are joined when adjusted."""
+    own = ([name for name in one.stations if "." not in name] for one in project.equate)
+    return [names for names in own if len(names) > 1]
+
+
+def sources_of(project: Project) -> str:
+    """Return a hash of what the legs are made of."""
+    sources = [one.logs for one in project.dive], project.mark, own_equates(project)
+    return hashlib.sha256(msgspec.json.encode(sources)).hexdigest()[:16]
 
 
 def write_derived(path: Path, derived: dict[str, list[Any]]) -> None:
