@@ -11,6 +11,7 @@ from buddyline.tools.survey.geodesy import Projection, declination, grid_of, rad
 from buddyline.tools.survey.lines import bearing_of, line_of, measures_of
 from buddyline.tools.survey.network import adjust
 from buddyline.tools.survey.project import DiveFiles, Edit, FixedPoint, Place, Project
+from msgspec import UNSET
 from msgspec.structs import replace
 
 from tests.tools import survey_world as world
@@ -119,15 +120,37 @@ def test_two_fixed_points_close_a_loop():
     assert off.loops[0].error_m == pytest.approx(3.0, abs=0.01)
 
 
-def test_unconnected_legs_are_left_out():
+@pytest.mark.parametrize(("lost", "left_out"), [(4, [5]), (2, [0, 1]), (3, [4, 5])])
+def test_legs_that_hang_on_nothing_are_left_out_and_the_larger_part_stays(lost, left_out):
     course = world.line(np.random.default_rng(4), 6)
     legs = world.readings_of(course, np.random.default_rng(1))
-    del legs[2]
+    del legs[lost]
     adjusted = adjust(world.project_of(legs))
     assert [(leg.name, why) for leg, why in adjusted.left_out] == [
-        (f"{k}-{k + 1}", "not connected to a fixed point") for k in (3, 4, 5)
+        (f"{k}-{k + 1}", "not connected to a fixed point") for k in left_out
     ]
-    assert "4" not in adjusted.positions
+    assert str(left_out[-1]) not in adjusted.positions
+
+
+@pytest.mark.parametrize("change", [{"use": False}, {"azimuth_deg": UNSET, "back_azimuth_deg": UNSET}])
+def test_a_first_leg_that_does_not_count_takes_no_other_leg_with_it(change):
+    legs = world.readings_of(world.line(np.random.default_rng(4), 6), np.random.default_rng(1))
+    edit = [Edit(leg="0-1", use=False)] if "use" in change else []
+    if not edit:
+        legs[0] = replace(legs[0], **change)
+    adjusted = adjust(world.project_of(legs, edit=edit))
+    assert [leg.name for leg, _ in adjusted.left_out] == ["0-1"]
+    assert set(adjusted.positions) - {"0"} == {str(k) for k in range(1, 7)}
+
+
+def test_an_altitude_and_a_water_level_that_contradict_are_no_silence():
+    legs = world.readings_of(world.line(np.random.default_rng(4), 4), np.random.default_rng(1))
+    for off_m, wrong in ((0.0, False), (2.0, True)):
+        altitude_m = 100.0 - legs[0].depth_from_m + off_m
+        fix = [FixedPoint(station="0", east_m=0.0, north_m=0.0, altitude_m=altitude_m, altitude_sigma_m=0.02)]
+        adjusted = adjust(world.project_of(legs, fix=fix, place=Place(water_level_m=100.0)))
+        causes = {cause for one in adjusted.blunders for cause in (one.cause, *one.others)}
+        assert ("fixed point 0" in causes) == wrong
 
 
 def test_a_fixed_point_without_a_station_is_an_error():

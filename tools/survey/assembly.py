@@ -245,7 +245,8 @@ def assemble(
             sighted.carry(to, number, start, end)
         for slope, sigma in slopes_of(leg):
             of.add("inclination", start, end, slope, sigma, leg=number, what="clinometers")
-    free_level = any(not math.isnan(position[2]) for position, _ in fixed.values())
+    level_stated = project.place.water_level_m is not UNSET
+    free_level = not level_stated and any(not math.isnan(position[2]) for position, _ in fixed.values())
     if project.adjust.depth == "absolute":
         _add_depths(to, tides, level_m - origin_m[2], free_level=free_level)
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final
@@ -16,6 +17,7 @@ from buddyline.tools.survey.gauges import tides_of
 from buddyline.tools.survey.geodesy import Grid, leg_date
 from buddyline.tools.survey.lines import ABSOLUTE_DEPTH_SIGMA_M, Line, Measures, line_of, measures_of, slopes_of
 from buddyline.tools.survey.observations import Solution
+from buddyline.tools.survey.old.model import merged
 from buddyline.tools.survey.placing import place_all, step_m_of
 from buddyline.tools.survey.project import Leg, Project
 from msgspec import UNSET, structs
@@ -66,19 +68,27 @@ def fixed_points(project: Project, grid: Grid) -> Fixed:
     fixed: Fixed = {}
     for fix in project.fix:
         altitude_m, altitude_sigma_m = fix.altitude_m, fix.altitude_sigma_m
-        if fix.station in by_depth and (altitude_m is UNSET or project.place.water_level_m is not UNSET):
-            altitude_m = math.nan
-        elif altitude_m is UNSET:
-            altitude_m, altitude_sigma_m = level_m - depths.get(fix.station, 0.0), 0.0
+        if altitude_m is UNSET:
+            by_gauge = fix.station in by_depth
+            altitude_m, altitude_sigma_m = math.nan if by_gauge else level_m - depths.get(fix.station, 0.0), 0.0
         sigmas_m = np.array([fix.sigma_m, fix.sigma_m, altitude_sigma_m])
         fixed[fix.station] = np.array([*grid.position_m(fix), altitude_m]), sigmas_m
     if not fixed:
         if not project.leg:
             raise BuddylineError("the project has no legs; run `buddyline survey legs` first")
-        start = project.leg[0].from_
+        start = _start_of(project)
         altitude_m = math.nan if start in by_depth else level_m - depths.get(start, 0.0)
         fixed[start] = np.array([0.0, 0.0, altitude_m]), np.zeros(3)
     return fixed
+
+
+def _start_of(project: Project) -> str:
+    """Return the first station of the largest part of a survey that legs in use join."""
+    legs = [leg for leg in project.used(project.leg) if leg.from_ != leg.to] or project.leg
+    directed = [leg for leg in legs if (leg.azimuth_deg, leg.back_azimuth_deg) != (UNSET, UNSET)] or legs
+    part_of = merged((leg.from_, leg.to) for leg in directed)
+    (largest, _), *_ = Counter(part_of(leg.from_) for leg in directed).most_common(1)
+    return next(leg.from_ for leg in directed if part_of(leg.from_) == largest)
 
 
 class Survey:
@@ -92,7 +102,7 @@ class Survey:
         self.fixed = fixed_points(project, grid)
         stations = {name for leg in project.leg for name in (leg.from_, leg.to)}
         for name in self.fixed:
-            if name not in stations:
+            if name not in stations and not project.old:
                 raise BuddylineError(f"fix of {name!r}: no leg has this station; known: {', '.join(sorted(stations))}")
         for one in project.known:
             if missing := {one.from_, one.to} - stations:
