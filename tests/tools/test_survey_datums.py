@@ -123,6 +123,19 @@ def test_bad_tapes_are_refused(tmp_path, row, said):
     assert said in str(refused.value)
 
 
+def test_a_plumbed_tape_may_be_a_little_shorter_than_its_depths_differ(tmp_path):
+    """Two points are one above the other: their gauges err by more than the tape is longer."""
+    places, depths, _ = site(2)
+    places[1] = places[0] + (0.02, 0.0, 4.0)
+    depths[1] = depths[0] + 4.03
+    tapes = {(i, j): float(np.linalg.norm(places[i] - places[j])) for i, j in PAIRS}
+    adjusted = adjusted_of(tmp_path, depths, tapes)
+    assert not adjusted.left_out
+    assert not adjusted.blunders
+    found = np.array([adjusted.positions[str(i)].position_m for i in range(6)])
+    assert np.linalg.norm(found[1] - found[0]) == pytest.approx(4.0, abs=0.03)
+
+
 def test_the_example_site_is_adjusted(capsys):
     parser = argparse.ArgumentParser()
     command.add_arguments(parser)

@@ -76,6 +76,19 @@ def differences(adjusted, found, *, shift=False):
     return [np.abs(p.position_m - found[name] - start).max() for name, p in adjusted.positions.items()]
 
 
+def by_therion(folder, sheet):
+    """Stations by the real therion."""
+    (folder / "survey.th").write_text(survex.th(sheet))
+    grid = survex.coordinate_system(sheet)
+    system = f"cs {grid}\n" if grid else ""
+    (folder / "thconfig").write_text(f"{system}source survey.th\nexport model -o survey.3d -fmt survex\n")
+    done = subprocess.run(
+        ["therion", "-q"], cwd=folder, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+    assert done.returncode == 0, done.stdout[-500:]
+    return world.coordinates(folder / "survey.3d")
+
+
 @CAVERN
 @pytest.mark.parametrize("depth", ["absolute", "readings"])
 @pytest.mark.parametrize("place", list(PLACES))
@@ -90,6 +103,19 @@ def test_cavern_agrees_to_the_centimetre(tmp_path, make, place, depth):
         assert h == pytest.approx(ratio(adjusted), rel=0.05, abs=0.02)
         # Held depths close by construction: cavern has no other to judge by.
         assert v < 0.01 if depth == "absolute" else v == pytest.approx(loop.vertical_ratio, rel=0.15, abs=0.05)
+
+
+@CAVERN
+@THERION
+@pytest.mark.parametrize("name", ["my cave", "H\u00f6hle", "a.b", ""])
+def test_a_project_may_have_any_name(tmp_path, name):
+    project, adjusted = survey()
+    project = replace(project, survey=replace(project.survey, name=name))
+    sheet = Sheet(project, adjusted)
+    said, _, found = world.cavern(tmp_path, survex.svx(sheet))
+    assert not said
+    assert max(differences(adjusted, found)) <= SAME_M
+    assert max(differences(adjusted, by_therion(tmp_path, sheet))) <= SAME_M
 
 
 @CAVERN
@@ -223,16 +249,7 @@ def test_cavern_reads_compass_data(tmp_path):
 def test_therion_agrees_to_the_centimetre(tmp_path, make, place):
     project, adjusted = survey(make, **PLACES[place])
     project = replace(project, survey=replace(project.survey, team=["A.", "Ann B. C. van Diver", 'Bo "Fin" O\'Neill']))
-    (tmp_path / "survey.th").write_text(survex.th(Sheet(project, adjusted)))
-    grid = survex.coordinate_system(Sheet(project, adjusted))
-    system = f"cs {grid}\n" if grid else ""
-    (tmp_path / "thconfig").write_text(f"{system}source survey.th\nexport model -o survey.3d -fmt survex\n")
-    done = subprocess.run(
-        ["therion", "-q"], cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S, check=False
-    )
-    assert done.returncode == 0, done.stdout[-500:]
-    found = world.coordinates(tmp_path / "survey.3d")
-    assert max(differences(adjusted, found)) <= SAME_M
+    assert max(differences(adjusted, by_therion(tmp_path, Sheet(project, adjusted)))) <= SAME_M
 
 
 def test_an_unknown_declination_is_never_written():

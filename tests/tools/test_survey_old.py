@@ -1,6 +1,8 @@
 """Old surveys: adjusted with new legs, and written again, against the programs that made them."""
 
 import argparse
+import csv
+import io
 import re
 import shutil
 import subprocess
@@ -303,6 +305,27 @@ def run(*words):
     parser = argparse.ArgumentParser()
     command.add_arguments(parser)
     return command.run(parser.parse_args([str(word) for word in words]))
+
+
+def test_fixed_points_without_legs_go_in_and_out(tmp_path, capsys):
+    (tmp_path / "peaks.svx").write_text(
+        "*cs UTM33N\n*cs out UTM33N\n*cs out UTM60S\n*fix top 412345 5187654 1820\n*fix hut 412600 5187000 1400\n"
+    )
+    path = tmp_path / "all.toml"
+    assert run("import", path, tmp_path / "peaks.svx") == 0
+    capsys.readouterr()
+    assert run("export", path, "--format", "stations", "-o", "-") == 0
+    rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
+    assert [(row["name"], row["east_m"], row["north_m"], row["up_m"]) for row in rows] == [
+        ("peaks.top", "412345.000", "5187654.000", "1820.000"),
+        ("peaks.hut", "412600.000", "5187000.000", "1400.000"),
+    ]
+    assert run("export", path, "--format", "svx", "-o", tmp_path / "out.svx") == 0
+    found = by_cavern(tmp_path, (tmp_path / "out.svx").read_text(), "again")
+    assert found["peaks.top"] == pytest.approx([412345, 5187654, 1820], abs=SAME_M)
+    path.write_text(path.read_text() + '\n[[fix]]\nstation = "peaks.tpo"\neast_m = 0\nnorth_m = 0\n')
+    with pytest.raises(BuddylineError, match=r"fix of 'peaks\.tpo': no leg and no old survey"):
+        run("adjust", path)
 
 
 def test_the_command_takes_old_surveys_into_a_project(tmp_path, capsys):

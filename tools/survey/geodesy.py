@@ -165,7 +165,7 @@ def declination(project: Project) -> Declination | None:
         source = place.declination_source or "stated in the project"
         return Declination(source, math.radians(place.declination_deg))
     magnetic = [leg for leg in project.leg + project.point if leg.turn_deg is leg.declination_deg is UNSET]
-    if not magnetic and project.leg:
+    if not magnetic:
         read = any(leg.azimuth_deg is not UNSET or leg.back_azimuth_deg is not UNSET for leg in project.leg)
         return Declination("stated with the old surveys" if read else "no bearing was read", 0.0)
     where = _somewhere(project)

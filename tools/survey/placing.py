@@ -36,8 +36,8 @@ def place_all(
         if step_m is not None:
             touching.setdefault(start, []).append((end, step_m))
             touching.setdefault(end, []).append((start, -step_m))
-        elif (rise_m := _rise_m(leg)) is not None and abs(rise_m) < leg.distance_m:
-            run_m = math.sqrt(leg.distance_m**2 - rise_m**2)
+        elif (rise_m := _rise_m(leg)) is not None and (abs(rise_m) < leg.distance_m or not _has_bearing(leg)):
+            run_m = math.sqrt(max(leg.distance_m**2 - rise_m**2, 0.0))
             ranges.setdefault(start, []).append((end, run_m, rise_m))
             ranges.setdefault(end, []).append((start, run_m, -rise_m))
     known = {(one.from_, one.to) for one in project.known if one.azimuth_deg is not UNSET}
@@ -46,8 +46,10 @@ def place_all(
     _walk(placed, touching, deque(fixed))
     if not touching and ranges and len(fixed) == 1 and not known:
         start = next(iter(fixed))
-        if start in ranges:
-            other, run_m, rise_m = ranges[start][0]
+        # A plumbed line has no direction on the map.
+        level = [one for one in ranges.get(start, ()) if one[1] > CLEAR_M]
+        if level:
+            other, run_m, rise_m = level[0]
             along = start, other
             placed[other] = placed[start] + (0.0, run_m, rise_m)
     mirrored = along is not None
@@ -63,8 +65,12 @@ def place_all(
     return placed, why, along
 
 
+def _has_bearing(leg: Leg) -> bool:
+    return leg.azimuth_deg is not UNSET or leg.back_azimuth_deg is not UNSET
+
+
 def _no_direction(leg: Leg) -> str:
-    if leg.azimuth_deg is UNSET and leg.back_azimuth_deg is UNSET:
+    if not _has_bearing(leg):
         return "no bearing, and too few distances to place its station"
     return "no bearing, or no slope that its distance allows"
 

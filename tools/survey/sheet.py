@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -81,7 +82,8 @@ class Sheet:
         about = project.survey
         theirs = {station.partition(".")[0] for old in olds for station in old.stations}
         # A survey of the hierarchy has one name.
-        self.name = f"{about.name}_{OWN}" if about.name in theirs else about.name
+        self.name = re.sub(r"[^A-Za-z0-9_-]", "_", about.name) or "survey"
+        self.name += f"_{OWN}" * (self.name in theirs)
         self.title = about.title or about.name
         self.team = about.team
         when = survey_date(project)

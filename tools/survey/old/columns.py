@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import re
 from datetime import date
 from pathlib import Path
@@ -30,6 +31,8 @@ COLUMNS: Final = {
 }
 FEET: Final = frozenset(("ft", "feet", "foot"))
 GRADS: Final = frozenset(("grad", "grads", "gon"))
+# A tape may be shorter than the depths differ by this many sd.
+DEPTH_SIGMAS: Final = 3.0
 # TopoDroid's shots have no line of names.
 TOPODROID: Final = ("from", "to", "tape", "compass", "clino")
 
@@ -137,9 +140,10 @@ def _distance(
     line: SourceLine,
 ) -> None:
     """Add a distance without a direction."""
-    if tape_m <= abs(depths_m[1] - depths_m[0]):
-        raise line.error(f"distance: {tape_m:g} m is less than the difference of depth")
     shot = OldShot(*ends, "distance", tape_m=tape_m, depths_m=depths_m, sigmas=sigmas, place=line.place)
+    least_m = abs(depths_m[1] - depths_m[0]) - DEPTH_SIGMAS * math.hypot(shot.sigma("tape"), shot.sigma("depth"))
+    if tape_m <= max(least_m, 0.0):
+        raise line.error(f"distance: {tape_m:g} m is less than the difference of depth")
     survey.shots.append(shot)
 
 

@@ -102,7 +102,6 @@ def joined(project: Project, olds: Sequence[OldSurvey]) -> Project:
         structs.replace(leg, from_=same_as(leg.from_), to=same_as(leg.to))
         for leg in [*project.leg, *(leg for old in olds for leg in legs_of(old))]
     ]
-    known = {name for leg in legs for name in (leg.from_, leg.to)}
     place = project.place
     system = next((name for old in olds if (name := map_system(old))), "")
     if system and place.epsg is UNSET and place.utm_zone is UNSET:
@@ -117,10 +116,14 @@ def joined(project: Project, olds: Sequence[OldSurvey]) -> Project:
     fixes: dict[str, FixedPoint] = {
         same_as(fix.station): structs.replace(fix, station=same_as(fix.station)) for fix in project.fix
     }
+    if len(fixes) < len(project.fix):
+        raise ConfigError("fix: two of the stations are one place by [[equate]]; give one place, or their mean")
+    if unknown := set(fixes) - {same_as(name) for name in stations}:
+        raise ConfigError(f"fix of {min(unknown)!r}: no leg and no old survey has this station")
     for old in olds:
         for fix in old.fixes:
             station = same_as(fix.station)
-            if station not in known or station in fixes:
+            if station in fixes:
                 continue
             east_m, north_m = moved(fix, wanted) if wanted else fix.position[:2]
             fixes[station] = FixedPoint(

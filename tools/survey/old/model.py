@@ -229,9 +229,12 @@ def merged(equates: Iterable[tuple[StationName, ...]]) -> Callable[[StationName]
     parent: dict[StationName, StationName] = {}
 
     def root(name: StationName) -> StationName:
-        while name in parent:
-            name = parent[name]
-        return name
+        top = name
+        while top in parent:
+            top = parent[top]
+        while name != top:
+            parent[name], name = top, parent[name]
+        return top
 
     for first, *others in equates:
         for other in others:

@@ -267,7 +267,8 @@ class SvxReader:
         if not words:
             raise line.error("*cs without a coordinate system")
         if words[0].lower() == "out":
-            self.survey.system = " ".join(words[1:])
+            # As in Survex, the first one counts: so surveys with systems of their own can be included in another.
+            self.survey.system = self.survey.system or " ".join(words[1:])
         else:
             self._system = " ".join(words)
 
