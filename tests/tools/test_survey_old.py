@@ -18,7 +18,7 @@ from buddyline.tools.survey.old.model import OldSurvey
 from buddyline.tools.survey.old.readers import read_old
 from buddyline.tools.survey.old.systems import map_system
 from buddyline.tools.survey.old.writing import svx_of, svx_system, th_of, therion_system
-from buddyline.tools.survey.project import Equate, Project, load_project
+from buddyline.tools.survey.project import Equate, FixedPoint, Place, Project, load_project
 from buddyline.tools.survey.sheet import Sheet
 from msgspec import UNSET
 from msgspec.structs import replace
@@ -240,6 +240,38 @@ def test_new_legs_hang_on_an_old_survey_in_one_adjustment(tmp_path, first):
     text = survex.th(sheet)
     assert "survey cave" in text
     assert ("equate 4@demo 3@stream.cave" in text) == (first == "new")
+
+
+@CAVERN
+@THERION
+@pytest.mark.parametrize("own_legs", [False, True])
+@pytest.mark.parametrize("dated", [False, True])
+@pytest.mark.parametrize("place", ["grid", "degrees", "stated", "nowhere"])
+def test_magnetic_bearings_of_a_table_are_turned_alike_here_and_in_both_programs(tmp_path, place, dated, own_legs):
+    where = {"latitude_deg": 45.5, "longitude_deg": 10.9}
+    known = {
+        "grid": Place(**where, utm_zone="32N"),
+        "degrees": Place(**where),
+        "stated": Place(declination_deg=3.5),
+        "nowhere": Place(),
+    }[place]
+    day = "2019-07-27" if dated else ""
+    rows = [f"A,B,80,90,0,{day}", f"B,C,50,0,5,{day}"]
+    (tmp_path / "old.csv").write_text("\n".join(["from,to,length,azimuth,clino,date", *rows, ""]))
+    old = named(read_old(tmp_path / "old.csv"), "old")
+    legs = world.readings_of(world.line(np.random.default_rng(6), 4), np.random.default_rng(2)) if own_legs else []
+    first = "0" if own_legs else "old.A"
+    fix = [FixedPoint(station=first, altitude_m=5.0, **where)] if place in ("grid", "degrees") else []
+    equate = [Equate(stations=["0", "old.A"])] if own_legs else []
+    project = joined(world.project_of(legs, place=known, fix=fix, equate=equate), [old])
+    adjusted = adjust(project)
+    sheet = Sheet(project, adjusted, [old])
+    (tmp_path / "out.th").write_text(survex.th(sheet))
+    grid = "EPSG:32632" if place == "grid" else ""
+    for found in (by_cavern(tmp_path, survex.svx(sheet), "out"), by_therion(tmp_path, "out.th", "out", grid)):
+        for name, position in adjusted.positions.items():
+            key = name.lower() if "." in name else f"demo.{name}"
+            assert np.abs(found[key] - position.position_m).max() <= 0.02, name
 
 
 def without_bearings(leg):

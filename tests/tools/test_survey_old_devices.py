@@ -5,11 +5,9 @@ import zipfile
 
 import pytest
 from buddyline.protocol.errors import BuddylineError
-from buddyline.tools.survey.old.joining import joined, read_project_files
-from buddyline.tools.survey.old.model import North
+from buddyline.tools.survey.old.joining import joined
 from buddyline.tools.survey.old.readers import read_old
-from buddyline.tools.survey.old.writing import svx_of
-from buddyline.tools.survey.project import OldFile, Place, Project
+from buddyline.tools.survey.project import Project
 
 SECTION_MARK, SHOT_MARK, SHOT_END = b"\x44\x59\x65", b"\x39\x43\x4d", b"\x5f\x19\x23"
 
@@ -203,17 +201,3 @@ def test_a_damaged_archive_is_refused(tmp_path):
     path.write_bytes(data)
     with pytest.raises(BuddylineError, match=r"cave\.tml: cannot be unpacked"):
         read_old(path)
-
-
-def test_magnetic_bearings_are_turned_alike_here_and_in_a_written_file(tmp_path):
-    tml(tmp_path / "cave.tml", LOOP)
-    (old,) = read_project_files(Project(old=[OldFile(file="cave.tml")]), tmp_path)
-    assert old.shots[0].north == North("model", at=("long-lat", -87.48, 20.25, 0.0))
-    assert any(line.startswith("*declination auto -87.48") for line in svx_of(old).lines)
-
-
-def test_magnetic_bearings_without_a_fixed_point_are_of_the_projects_place(tmp_path):
-    dmp(tmp_path / "cave.dmp", section(5, b"AA1", [shot(5, 900, 900, 500, (0, 0))]))
-    place = Place(latitude_deg=20.25, longitude_deg=-87.48)
-    (old,) = read_project_files(Project(old=[OldFile(file="cave.dmp")], place=place), tmp_path)
-    assert old.shots[0].north == North("model", at=("long-lat", -87.48, 20.25, 0.0))

@@ -3,10 +3,21 @@
 import pytest
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.survey.old.joining import joined, named
+from buddyline.tools.survey.old.model import North
+from buddyline.tools.survey.old.readers import read_old
 from buddyline.tools.survey.old.systems import map_system
 from buddyline.tools.survey.project import Project
 
 from tests.tools.old_cave import CAVE, DAT, TH, read
+
+
+def test_bearings_of_a_table_are_magnetic_where_it_states_no_declination(tmp_path):
+    (tmp_path / "d.csv").write_text(
+        "from,to,length,azimuth,clino,declination,date\n1,2,5,90,0,,2019-07-27\n2,3,5,90,0,2.5,\n3,4,5,90,0,,\n"
+    )
+    old = read_old(tmp_path / "d.csv")
+    assert [shot.north for shot in old.shots] == [North("model"), North("grid", 2.5), North("model")]
+    assert old.left_out == ["shots with neither declination nor date: 1; there declination is 0"]
 
 
 def test_a_svx_file_is_read_as_it_is_meant(tmp_path):

@@ -15,8 +15,8 @@ from buddyline.tools.survey.geodesy import leg_date, survey_date
 from buddyline.tools.survey.lines import Line, bearing_of
 from buddyline.tools.survey.marks import section_of
 from buddyline.tools.survey.network import Adjusted
-from buddyline.tools.survey.old.joining import same_place
-from buddyline.tools.survey.old.model import CrossSection, OldShot, OldSurvey, merged
+from buddyline.tools.survey.old.joining import leg_of, same_place
+from buddyline.tools.survey.old.model import CrossSection, North, OldShot, OldSurvey, merged
 from buddyline.tools.survey.project import Leg, Project
 from msgspec import UNSET, structs
 
@@ -77,8 +77,17 @@ class Sheet:
         def placed(shot: OldShot) -> bool:
             return shot.style != "distance" or {same_as(shot.start), same_as(shot.end)} <= set(adjusted.positions)
 
-        # Distances that are too few to place a station: no cave program takes it.
-        self.olds = [replace(old, shots=list(filter(placed, old.shots))) for old in olds]
+        def turned(shot: OldShot) -> OldShot:
+            if shot.north != North("model"):
+                return shot
+            leg, start = leg_of(shot), adjusted.positions.get(same_as(shot.start))
+            where = None if start is None else start.position_m
+            turn_rad = adjusted.grid.leg_turn_rad(leg, leg_date(project, leg), where)
+            return replace(shot, north=North("grid", math.degrees(turn_rad)))
+
+        # Distances that are too few to place a station: no cave program takes it. What a file does not tell the north
+        # of, nor the place for a magnetic model, has the angle that counts here.
+        self.olds = [replace(old, shots=[turned(shot) for shot in old.shots if placed(shot)]) for old in olds]
         about = project.survey
         theirs = {station.partition(".")[0] for old in olds for station in old.stations}
         # A survey of the hierarchy has one name.
@@ -115,6 +124,12 @@ class Sheet:
         """The map grid's name: a UTM zone, or a code of the EPSG registry; empty without one."""
         zone, projection = self.project.place.utm_zone, self.adjusted.grid.projection
         return f"UTM {zone}" if zone is not UNSET else f"EPSG:{projection.epsg}" if projection is not None else ""
+
+    @property
+    def grid_turn_deg(self) -> float | None:
+        """The azimuth of the map grid's north where the survey is; None without a grid."""
+        grid = self.adjusted.grid
+        return None if grid.projection is None else math.degrees(grid.convergence_rad())
 
     @property
     def instruments(self) -> dict[str, str]:

@@ -233,7 +233,7 @@ def _svx_file(sheet: Sheet, body: list[str]) -> str:
 
 def _svx_olds(sheet: Sheet, grid: str) -> Iterator[str]:
     """Yield the old surveys as they were read, each in a block of its own, and what joins them to this one."""
-    olds = [svx_of(old, grid) for old in sheet.olds]
+    olds = [svx_of(old, grid, sheet.grid_turn_deg) for old in sheet.olds]
     for number, written in enumerate(olds):
         if not grid and not number:
             yield from svx_system(sheet.olds[0])
@@ -295,7 +295,7 @@ def th(sheet: Sheet, style: str = "auto") -> str:
 
 
 def _th_olds(sheet: Sheet, grid: str) -> Iterator[str]:
-    olds = [th_of(old, grid) for old in sheet.olds]
+    olds = [th_of(old, grid, sheet.grid_turn_deg) for old in sheet.olds]
     for written in olds:
         yield from written.lines
     joints, fixes = _joints(sheet, olds, THERION, lambda name: f"{sheet.local(name)}@{sheet.name}")

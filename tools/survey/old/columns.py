@@ -62,6 +62,8 @@ def read_csv(survey: OldSurvey, path: Path, prefix: SurveyPath) -> None:
     for line in lines:
         row = dict(zip(names, _cells(line, gap), strict=False))
         _shot(survey, row, dict(zip(names, units, strict=True)), line, prefix)
+    if lost := sum(shot.north == North("model") and shot.when is None for shot in survey.shots):
+        survey.left_out.append(f"shots with neither declination nor date: {lost}; there declination is 0")
 
 
 def _cells(line: SourceLine, gap: str) -> list[str]:
@@ -103,6 +105,7 @@ def _shot(
             raise line.error(f"{line.text.strip()!r}: no azimuth, and for a distance alone no depths of both ends")
         _distance(survey, (start, end, path), tape, (depths[0], depths[1]), sigmas, line)
         return
+    turn_deg = value("declination")
     flags = frozenset(word for word in re.split(r"[\s|;]+", row.get("flags", "").lower()) if word)
     by_depth = depths[0] is not None and depths[1] is not None and clino is None
     survey.shots.append(
@@ -119,7 +122,7 @@ def _shot(
             rise_m=depths[0] - depths[1] if by_depth and depths[0] is not None and depths[1] is not None else None,
             flags=flags if end else flags | {"splay"},
             when=_date(row.get("date", ""), line),
-            north=North("grid", value("declination") or 0.0),
+            north=North("model") if turn_deg is None else North("grid", turn_deg),
             sigmas=sigmas,
             note=row.get("note", ""),
             place=line.place,

@@ -12,9 +12,9 @@ from typing import Any, Final
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import ConfigError
 from buddyline.tools.survey.geodesy import utm_epsg
-from buddyline.tools.survey.old.model import LEAST_M, North, OldShot, OldSurvey, StationName, merged
+from buddyline.tools.survey.old.model import LEAST_M, OldShot, OldSurvey, StationName, merged
 from buddyline.tools.survey.old.readers import read_old
-from buddyline.tools.survey.old.systems import DEGREES, crs_of, map_system, moved
+from buddyline.tools.survey.old.systems import crs_of, map_system, moved
 from buddyline.tools.survey.project import STATION_NAME, FixedPoint, Leg, Project, Station
 from msgspec import UNSET, structs
 
@@ -33,24 +33,8 @@ def read_project_files(project: Project, folder: Path) -> list[OldSurvey]:
         if name in names:
             raise ConfigError(f"old.name {name!r}: two old surveys have it; name one of them otherwise")
         names.add(name)
-        found.append(_located(named(read_old(folder / one.file), name), project))
+        found.append(named(read_old(folder / one.file), name))
     return found
-
-
-def _located(survey: OldSurvey, project: Project) -> OldSurvey:
-    """Return a survey with a place for its magnetic bearings: its own fixed point, or the project's place."""
-    known = next((fix for fix in survey.fixes if fix.system), None)
-    degrees = project.place.degrees
-    if known is not None:
-        at = known.system, *known.position
-    elif degrees is not None:
-        at = DEGREES, degrees[1], degrees[0], 0.0
-    else:
-        return survey
-    shots = [
-        replace(shot, north=North("model", at=at)) if shot.north == North("model") else shot for shot in survey.shots
-    ]
-    return replace(survey, shots=shots)
 
 
 def name_of(path: Path) -> str:
@@ -139,6 +123,7 @@ def joined(project: Project, olds: Sequence[OldSurvey]) -> Project:
     for edit in project.edit:
         if edit.leg not in names:
             raise ConfigError(f"edit of leg {edit.leg!r}: no such leg, nor in the old surveys")
+    lines = [structs.replace(one, from_=same_as(one.from_), to=same_as(one.to)) for one in project.known]
     points = [structs.replace(leg, from_=same_as(leg.from_)) for leg in project.point]
     stated = {station.name for station in project.station}
     depths = [
@@ -148,7 +133,13 @@ def joined(project: Project, olds: Sequence[OldSurvey]) -> Project:
         if same_as(one.name) not in stated
     ]
     return structs.replace(
-        project, leg=legs, point=points, fix=list(fixes.values()), place=place, station=project.station + depths
+        project,
+        leg=legs,
+        point=points,
+        fix=list(fixes.values()),
+        known=lines,
+        place=place,
+        station=project.station + depths,
     )
 
 

@@ -138,14 +138,18 @@ class Written:
     name: Callable[[StationName], str]
 
 
-def svx_of(survey: OldSurvey, system: str = "") -> Written:
-    """Return a survey in the language of Survex, without a heading. system: the map grid, if not the survey's own."""
+def svx_of(survey: OldSurvey, system: str = "", turn_deg: float | None = None) -> Written:
+    """Return a survey in the language of Survex, without a heading.
+
+    system, turn_deg: the map grid and the azimuth of its north, if not the survey's own.
+    """
+    turn_deg = convergence_deg(survey, system) if turn_deg is None else turn_deg
     more = _more_names(survey)
     names = _Names("A-Za-z0-9_.\\-" + re.escape(more))
     lines = ["*case preserve", "*alias station - .."]
     if more:
         lines.append(f"*set names _-{more}")
-    lines += _svx_block(survey, tree_of(survey), names, convergence_deg(survey, system))
+    lines += _svx_block(survey, tree_of(survey), names, turn_deg)
     lines += [f"*equate {' '.join(_dotted(names.anywhere(one)) for one in same)}" for same in survey.equates]
     lines += _fixes(survey, "*fix", lambda name: f"*cs {survex_system(name)}", " reference", names, _dotted)
     lines += [f"*entrance {_dotted(names.anywhere(one))}" for one in survey.entrances]
@@ -308,9 +312,10 @@ def remark_of(shot: OldShot) -> str:
     return " ".join(word for word in words if word)
 
 
-def th_of(survey: OldSurvey, system: str = "") -> Written:
-    """Return a survey in the language of Therion, without a heading. system: the map grid, if not the survey's own."""
-    names, turn_deg = _Names("A-Za-z0-9_.\\-'/+*"), convergence_deg(survey, system)
+def th_of(survey: OldSurvey, system: str = "", turn_deg: float | None = None) -> Written:
+    """Return a survey in the language of Therion, without a heading; see svx_of."""
+    names = _Names("A-Za-z0-9_.\\-'/+*")
+    turn_deg = convergence_deg(survey, system) if turn_deg is None else turn_deg
     survey, refused, known_as = _accepted_by_therion(survey)
     lines = list(_th_block(survey, tree_of(survey), names, turn_deg))
     lines += [f"# no shot, as both its ends are one station: {remark_of(shot)}" for shot in refused]
