@@ -227,7 +227,7 @@ def test_an_inverse_stays_sparse_over_long_lines_and_many_dives(legs, of_a_dive)
     adjusted = adjust(world.project_of([replace(leg, dive=1 + k // of_a_dive) for k, leg in enumerate(read)]))
     solved = adjusted.solution.normal
     # Of neighbours and of a dive's own instruments, not of other dives'.
-    assert np.mean([len(below) for below in solved._tree.below]) < 40
+    assert np.mean([len(below) for below in solved.tree.below]) < 40
     for name in ("1", str(legs // 2), str(legs)):
         number = adjusted.solution.observations.at[name]
         unit = np.zeros((len(adjusted.solution.x), 3))

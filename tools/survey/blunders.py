@@ -148,8 +148,8 @@ def _suspects(survey: Survey, solution: Solution, taken: Change) -> Iterator[_Su
     model, of, r = solution.model, solution.observations, solution.redundancies
     scale, known = variance_factor(solution)
     w2 = solution.suspicion / scale
-    least = np.where(model.leg >= 0, CHECKED, TOLD_SHARE)
-    tried = (r > least) & ~model.robust & ~model.told_by_robust
+    told = np.where(model.leg >= 0, CHECKED, TOLD_SHARE)
+    tried = (r > told) & ~model.robust & ~model.told_by_robust
     every = list(_visits(survey, taken))
     critical = critical_chi2(int(tried.sum()) + len(every), known)
     # A disturbed compass pulls at gyroscopes here, but not in the adjustment, where its weight falls.
@@ -169,10 +169,15 @@ def _suspects(survey: Survey, solution: Solution, taken: Change) -> Iterator[_Su
         cause = f"leg {name}: {what}" if name else what
         drop = Change(drops=frozenset([(leg, what)]))
         yield _Suspect(cause, (name,) if name else (), drop, float(w2[row]), row)
+    of_leg = model.leg >= 0
+    shown = np.bincount(model.leg[of_leg], w2[of_leg], len(survey.legs)).tolist()
     worst = np.zeros(len(survey.legs))
-    np.maximum.at(worst, model.leg[model.leg >= 0], w2[model.leg >= 0])
-    visits = sorted(every, key=lambda visit: -max(worst[leg] for leg, _ in visit))[:VISITS_TRIED]
-    if not visits or worst.max(initial=0.0) <= critical / 2:
+    np.maximum.at(worst, model.leg[of_leg], w2[of_leg])
+    # Where no reading is suspected, what a stay's other place explains shows in the sum of its legs' residuals.
+    least = critical if worst.max(initial=0.0) <= critical else 0.0
+    suspected = [visit for visit in every if sum(shown[leg] for leg, _ in visit) > least]
+    visits = sorted(suspected, key=lambda visit: -max(worst[leg] for leg, _ in visit))[:VISITS_TRIED]
+    if not visits:
         return
     rows_of: dict[int, list[int]] = {}
     for row, leg in enumerate(model.leg.tolist()):

@@ -16,7 +16,7 @@ from buddyline.tools.survey.averages import Floats, wrap
 from buddyline.tools.survey.gauges import tides_of
 from buddyline.tools.survey.geodesy import Grid, leg_date
 from buddyline.tools.survey.lines import ABSOLUTE_DEPTH_SIGMA_M, Line, Measures, line_of, measures_of, slopes_of
-from buddyline.tools.survey.observations import Solution
+from buddyline.tools.survey.observations import Observations, Solution
 from buddyline.tools.survey.old.model import merged
 from buddyline.tools.survey.placing import place_all, step_m_of
 from buddyline.tools.survey.project import Leg, Project
@@ -171,16 +171,29 @@ class Survey:
 
     def adjust(self, change: Change | None = None, *, linear: bool = False) -> Solution:
         """Return the least squares solution, with other names and without the observations that a change drops."""
-        change = change or Change()
-        steps, ends, first_m = self.steps, self.ends, self.first_m
-        if change.names or change.drops:
+        if change is None or not (change.names or change.drops):
+            of, at_m = self._as_read
+        else:
             ends = [(self.name_at(n, 0, change), self.name_at(n, 1, change)) for n in range(len(self.legs))]
             legs = [_without(leg, number, change.drops) for number, leg in enumerate(self.legs)]
             steps = list(map(step_m_of, legs, self.turns_rad))
-            first_m = place_all(self.project, legs, ends, steps, self._starts())[0]
+            # Without the observation a station may hang on nothing; as before it is a place to begin with.
+            first_m = self.first_m | place_all(self.project, legs, ends, steps, self._starts())[0]
+            of, at_m = self._observed(ends, steps, first_m)
+            for row, key in enumerate(zip(of.leg, of.what, strict=True) if change.drops else ()):
+                if key in change.drops:
+                    of.sigma[row] *= DROPPED
+        return of.adjust(at_m, linear=linear)
+
+    @cached_property
+    def _as_read(self) -> tuple[Observations, Floats]:
+        return self._observed(self.ends, self.steps, self.first_m)
+
+    def _observed(
+        self, ends: list[tuple[str, str]], steps: list[Floats | None], first_m: dict[str, Floats]
+    ) -> tuple[Observations, Floats]:
+        """Return the observations with these ends of legs, and first places (s, 3) of their stations."""
         names = list(dict.fromkeys([*(name for name in self.fixed if name in first_m), *(n for e in ends for n in e)]))
-        # Without the observation a station hangs on nothing; as before it is a place to begin with.
-        first_m = self.first_m | first_m
         if lost := set(names) - set(first_m):
             raise BuddylineError(f"station {min(lost)} hangs on nothing")
         of = assemble(
@@ -196,10 +209,7 @@ class Survey:
             self.north_along,
         )
         of.vectors_m = np.array([NOWHERE if step_m is None else step_m for step_m in steps]).reshape(-1, 3)
-        for row, key in enumerate(zip(of.leg, of.what, strict=True) if change.drops else ()):
-            if key in change.drops:
-                of.sigma[row] *= DROPPED
-        return of.adjust(np.array([first_m[name] for name in names]) - self.origin_m, linear=linear)
+        return of, np.array([first_m[name] for name in names]) - self.origin_m
 
     def corrected(self, solution: Solution) -> list[Line]:
         """Return the legs between stations with what the instruments add taken off."""

@@ -21,13 +21,13 @@ WIDE: Final = 48
 class Normal:
     """N = A^T W A of rows A (m, n) as coordinates (row, column, value) and their weights (m,); positive definite.
 
-    blocks: (n,), from 0 without gaps: unknowns of one number are eliminated together. before: equations of the same
-    pattern; their order of elimination is used again.
+    blocks: (n,), from 0 without gaps: unknowns of one number are eliminated together. tree: of equations of the same
+    pattern, whose order of elimination is used again; None: of dense ones.
     Raises BuddylineError if an unknown is not determined.
     """
 
     def __init__(
-        self, at: tuple[Ints, Ints], values: Floats, weights: Floats, blocks: Ints, before: Normal | None = None
+        self, at: tuple[Ints, Ints], values: Floats, weights: Floats, blocks: Ints, tree: Tree | None = None
     ) -> None:
         self.count = count = len(blocks)
         rows, columns = at
@@ -39,7 +39,7 @@ class Normal:
         self._scale = 1 / np.sqrt(square)
         scaled = values * np.sqrt(weights[rows]) * self._scale[columns]
         self._lu: Any = None
-        self._tree: _Tree | None = None if before is None else before._tree
+        self.tree = tree
         try:
             if count <= DENSE:
                 A = np.zeros((len(weights), count))
@@ -57,18 +57,18 @@ class Normal:
             from scipy.sparse.linalg import splu
         except ModuleNotFoundError as error:
             raise BuddylineError("a survey of this size needs scipy: make install EXTRAS=survey") from error
-        if self._tree is None:
-            self._tree = _Tree(rows, columns, blocks)
-        A = csc_array((scaled, (rows, self._tree.place[columns])), shape=(int(rows.max()) + 1, self.count))
+        if self.tree is None:
+            self.tree = Tree(rows, columns, blocks)
+        A = csc_array((scaled, (rows, self.tree.place[columns])), shape=(int(rows.max()) + 1, self.count))
         self._lu = splu((A.T @ A).tocsc(), permc_spec="NATURAL", **SYMMETRIC)
 
     def solve(self, right: Floats) -> Floats:
         """Return N^-1 times right, (n,) or (n, k)."""
         scale = self._scale if right.ndim == 1 else self._scale[:, None]
         scaled = scale * right
-        if self._tree is None:
+        if self.tree is None:
             return np.asarray(scale * np.linalg.solve(self._dense, scaled))
-        tree = self._tree
+        tree = self.tree
         return np.asarray(scale * self._lu.solve(np.ascontiguousarray(scaled[tree.order]))[tree.place])
 
     def inverse(self, unknowns: Ints) -> Floats:
@@ -78,12 +78,12 @@ class Normal:
         tree alone (Gilbert 1994), so that few unknowns touch little of L.
         """
         scale = self._scale[unknowns]
-        if self._tree is None:
+        if self.tree is None:
             between = np.linalg.inv(self._dense)[np.ix_(unknowns, unknowns)]
         else:
             from scipy.sparse.linalg import splu
 
-            lower, here = self._lu.L, self._lu.perm_c[self._tree.place[unknowns]]
+            lower, here = self._lu.L, self._lu.perm_c[self.tree.place[unknowns]]
             lower.sort_indices()
             below = np.minimum(lower.indptr[:-1] + 1, lower.nnz - 1)
             parents = np.where(np.diff(lower.indptr) > 1, lower.indices[below], -1)
@@ -107,15 +107,15 @@ class Normal:
         at = [np.where(one >= 0, one, 0) for one in (groups, columns)]
         scales = [np.where(one >= 0, self._scale[here], 0.0) for one, here in zip((groups, columns), at, strict=True)]
         scaled = values * scales[1]
-        if self._tree is None:
+        if self.tree is None:
             inverse = np.linalg.inv(self._dense)
             found = inverse[at[0][:, :, None], at[0][:, None, :]]
             forms = np.einsum("mi,mij,mj->m", scaled, inverse[at[1][:, :, None], at[1][:, None, :]], scaled)
         else:
-            found, forms = self._selected(self._tree, groups, columns, scaled)
+            found, forms = self._selected(self.tree, groups, columns, scaled)
         return np.asarray(found * scales[0][:, :, None] * scales[0][:, None, :]), np.asarray(forms)
 
-    def _selected(self, tree: _Tree, groups: Ints, columns: Ints, values: Floats) -> tuple[Floats, Floats]:
+    def _selected(self, tree: Tree, groups: Ints, columns: Ints, values: Floats) -> tuple[Floats, Floats]:
         """Return what `blocks` does, scaled, of a sparse inverse (Takahashi, Fagan and Chin 1973), front by front.
 
         For columns J of L with rows R below them: with G = L_RJ L_JJ^-1, Z_RJ = -Z_RR G and
@@ -177,7 +177,7 @@ class Normal:
         return found, forms
 
 
-class _Tree:
+class Tree:
     """The elimination tree of rows' unknowns (Liu 1990), block by block, and its fronts: unknowns of one dense part.
 
     order, place: (n,), the unknown at each place, a postorder, and the place of each unknown. bounds: (f + 1,), places

@@ -10,7 +10,7 @@ from typing import Final, Literal, TypeAlias, get_args
 
 import numpy as np
 from buddyline.tools.survey.averages import Floats, Ints
-from buddyline.tools.survey.normal import Normal
+from buddyline.tools.survey.normal import Normal, Tree
 
 # distance, azimuth, inclination: of the line from start to end. east, north, up: of station `start`. rise: of end over
 # start. angle, number: of the instruments' unknowns alone.
@@ -21,6 +21,8 @@ ANGLES: Final = (_AZIMUTH, _INCLINATION, _ANGLE)
 # An iteration that moves nothing by more than this (m, rad) is the last.
 SETTLED: Final = 1e-3
 MOST_ITERATIONS: Final = 20
+# After a step that moves nothing by more than this (m, rad) the same equations do for the next ones.
+NEAR_M: Final = 0.05
 MOST_HALVINGS: Final = 6
 # What is left of a variance known beforehand, where the observations know better.
 KNOWN_SHARE: Final = 0.5
@@ -46,6 +48,7 @@ class Observations:
     robust: its errors have long tails. vectors_m: (l, 3), each leg's vector as read, NaN where it has none.
     loosen: rows of what is known beforehand, with their unknown: where the other observations know it better, they
     alone count, and the row has this sigma. rows: by leg's number and reading, where there is one alone of its kind.
+    tree: of their normal equations, once they have been adjusted.
     """
 
     stations: list[str]
@@ -62,6 +65,7 @@ class Observations:
     rows: dict[tuple[int, str], int] = field(default_factory=dict)
     loosen: dict[int, tuple[int, float]] = field(default_factory=dict)
     vectors_m: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    tree: Tree | None = None
     _term_row: list[int] = field(default_factory=list)
     _term_column: list[int] = field(default_factory=list)
     _term_value: list[float] = field(default_factory=list)
@@ -132,9 +136,13 @@ class Observations:
         x = np.concatenate([stations_m.ravel(), self.start_values])
         normal = None
         misfit, at, values = model.linear(x)
+        moved = math.inf
         for number in range(MOST_ITERATIONS):
             weights = model.weights(misfit) if number and not linear else model.sigma**-2
-            normal = Normal(at, values, weights, model.blocks, normal)
+            fresh = number < 2 or moved > NEAR_M or bool(model.robust.any())
+            if normal is None or fresh:
+                normal = Normal(at, values, weights, model.blocks, self.tree)
+                self.tree = normal.tree
             step = normal.solve(np.bincount(at[1], values * (weights * misfit)[at[0]], len(x)).astype(float))
             chi2 = float(weights @ misfit**2)
             for _ in range(MOST_HALVINGS):
@@ -142,8 +150,8 @@ class Observations:
                 if float(weights @ misfit**2) <= WORSE * chi2 + 1.0:
                     break
                 step = step / 2
-            x = x + step
-            if number and np.abs(step).max() < SETTLED:
+            x, moved = x + step, float(np.abs(step).max())
+            if number and moved < SETTLED:
                 break
             if not number:
                 freed = [
@@ -158,9 +166,9 @@ class Observations:
                     misfit, at, values = model.linear(x)
         # Residuals are judged by the weights that they come from: a linear step counts robust observations in full.
         weights = model.sigma**-2 if linear else model.weights(misfit)
-        # The last step was too short to turn the rows, but robust weights may have changed.
-        if normal is None or (model.robust.any() and not linear):
-            normal = Normal(at, values, weights, model.blocks, normal)
+        # Equations that have served for several steps are made again, and robust weights may have changed.
+        if normal is None or not fresh or (model.robust.any() and not linear):
+            normal = Normal(at, values, weights, model.blocks, self.tree)
         return Solution(self, model, x, misfit, at, values, weights, normal)
 
     def _is_told(self, normal: Normal, column: int, sigma: float) -> bool:

@@ -182,7 +182,7 @@ class Turn(Config, frozen=True, kw_only=True):
     sigma_deg: Positive
 
 
-class Leg(Config, frozen=True, kw_only=True):
+class Leg(Config, frozen=True, kw_only=True, gc=False):
     """[[leg]] and [[point]]: one shot from a station to a station or point, as read; angles magnetic, in degrees.
 
     azimuth_deg, inclination_deg: by the node at `from`, towards `to`; back_*: by the node at `to`, towards
@@ -240,7 +240,7 @@ class Leg(Config, frozen=True, kw_only=True):
         return datetime.fromtimestamp(self.start_ns / S_NS, UTC)
 
 
-class Station(Config, frozen=True, kw_only=True):
+class Station(Config, frozen=True, kw_only=True, gc=False):
     """[[station]]: depth_m: mean of what the gauges read there; readings: how many legs' gauges."""
 
     name: str
