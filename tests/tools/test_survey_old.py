@@ -360,6 +360,19 @@ def test_fixed_points_without_legs_go_in_and_out(tmp_path, capsys):
         run("adjust", path)
 
 
+@pytest.mark.parametrize("second", ["*fix a 10 0 0", "*fix b 0 10 0\n*equate a b"])
+def test_a_station_that_old_surveys_fix_at_two_places_is_refused(tmp_path, second):
+    text = f"*fix a 0 0 0\n{second}\n*data normal from to tape compass clino\na c 5 90 0\n"
+    (tmp_path / "twice.svx").write_text(text)
+    old = named(read_old(tmp_path / "twice.svx"), "old")
+    with pytest.raises(BuddylineError, match=r"is fixed 10\.00 m from where the same station was fixed before"):
+        joined(Project(), [old])
+    decided = joined(Project(fix=[FixedPoint(station="old.a", east_m=1.0, north_m=2.0)]), [old])
+    assert adjust(decided).positions["old.a"].position_m[:2] == pytest.approx([1.0, 2.0])
+    (tmp_path / "twice.svx").write_text(text.replace("10", "0"))
+    assert len(joined(Project(), [named(read_old(tmp_path / "twice.svx"), "old")]).fix) == 1
+
+
 def test_the_command_takes_old_surveys_into_a_project(tmp_path, capsys):
     (tmp_path / "cave.svx").write_text(CAVE)
     (tmp_path / "side.th").write_text(TH)

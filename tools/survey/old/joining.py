@@ -20,6 +20,9 @@ from msgspec import UNSET, structs
 
 # 1 sd of an angle that nothing tells, degrees.
 ANY_DEG: Final = 180.0
+# Two fixed points of one station are the same within this, m, and so many sds.
+SAME_M: Final = 0.02
+SAME_SIGMAS: Final = 3.0
 
 
 def read_project_files(project: Project, folder: Path) -> list[OldSurvey]:
@@ -100,6 +103,8 @@ def joined(project: Project, olds: Sequence[OldSurvey]) -> Project:
     fixes: dict[str, FixedPoint] = {
         same_as(fix.station): structs.replace(fix, station=same_as(fix.station)) for fix in project.fix
     }
+    stated_here = set(fixes)
+    placed: dict[StationName, tuple[tuple[float, float, float], tuple[float, float, float]]] = {}
     if len(fixes) < len(project.fix):
         raise ConfigError("fix: two of the stations are one place by [[equate]]; give one place, or their mean")
     if unknown := set(fixes) - {same_as(name) for name in stations}:
@@ -107,9 +112,19 @@ def joined(project: Project, olds: Sequence[OldSurvey]) -> Project:
     for old in olds:
         for fix in old.fixes:
             station = same_as(fix.station)
-            if station in fixes:
+            if station in stated_here:
                 continue
             east_m, north_m = moved(fix, wanted) if wanted else fix.position[:2]
+            here_m = east_m, north_m, fix.position[2]
+            first_m, first_sigmas_m = placed.setdefault(station, (here_m, fix.sigmas_m))
+            if station in fixes:
+                apart_m = math.dist(here_m, first_m)
+                if apart_m > SAME_M + SAME_SIGMAS * math.hypot(*fix.sigmas_m, *first_sigmas_m):
+                    raise ConfigError(
+                        f"{fix.place}: {fix.station} is fixed {apart_m:.2f} m from where the same station was fixed "
+                        f"before; a [[fix]] of {station!r} in the project would decide"
+                    )
+                continue
             fixes[station] = FixedPoint(
                 station=station,
                 east_m=east_m,
