@@ -129,7 +129,9 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
         for about in tries:
             told_by, by_first = sum(part.told_by), known if late else learned
             one = settled(about, part.detection, shaking, by_first, told_by, doubtful=late)
-            if one is not None and not _contradicts(one[1], part, NEAR_CLOCK_S if about is not path else MOST_LEFT_S):
+            limit_s = MOST_LEFT_S if about is path else NEAR_CLOCK_S
+            # What a late start tells of the clocks is little, and less than it believes.
+            if one is not None and (late or not _contradicts(one[1], part, limit_s)):
                 found.append(one)
                 break
         else:

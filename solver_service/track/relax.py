@@ -60,10 +60,10 @@ PASSES: Final = 12
 STAYS_SIGMAS: Final = 1.0
 DOUBTFUL_SIGMAS: Final = 0.3
 LOOKED_AT: Final = 10
-# Noise and units are judged by the samples of two seconds.
-KEPT_S: Final = 3.0
 UNFIT: Final = 1.5
 LEAST_TOLD: Final = 0.5
+# Noise and units are judged by the samples of two seconds.
+KEPT_S: Final = 3.0
 
 
 @dataclass(frozen=True, eq=False)

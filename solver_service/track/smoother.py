@@ -125,7 +125,8 @@ def smoothed(steps: Trail, about: Path | None = None) -> Path:
         later = step
     if count:
         path.oldest[:] = P
-        states = State.of_row(np.array(found) if about is None else about.states)
+        # A path may go on after the last picture, where a pass about it ends.
+        states = State.of_row(np.array(found) if about is None else about.states[:count])
         states = states if about is None else states.plus(np.array(found))
         path.states[:] = states.to_row()
         # Without a unit the turn rate is estimated, too (strapdown.process_noise).

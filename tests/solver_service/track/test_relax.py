@@ -57,6 +57,18 @@ def test_passes_about_a_path_that_is_off_end_at_the_same_path() -> None:
     assert moved(path, right) < 0.01
 
 
+def test_a_path_may_go_on_after_the_last_picture() -> None:
+    dive = make(5, Setting(seconds=4.0, false=0))
+    first = filter_of(dive.records, dive.fixes)
+    pass_over(first, dive.records, dive.fixes)
+    path = smoothed(parts_of(first)[0].steps)
+    last_ns = EPOCH_NS + 3_000_000_000
+    records = [replace(one, frames=[f for f in one.frames if f.stamp_ns < last_ns]) for one in dive.records]
+    shorter = passed_about(replace(dive, records=(records[0], records[1])), path)
+    assert 5 < len(shorter) < len(path) - 5
+    assert moved(replace(path, t_s=path.t_s[: len(shorter)]), shorter) < 1.0
+
+
 def test_pictures_are_weighed_together_by_all_the_dive_but_themselves() -> None:
     """Each as by the information filter's own algebra: what the picture told is subtracted from the information."""
     dive = make(7, Setting(seconds=6.0))
