@@ -38,10 +38,9 @@ from buddyline.solver_service.track.records import (
     pass_over,
     stamp_of,
 )
-from buddyline.solver_service.track.relax import PassedOver, PathPass, settled
+from buddyline.solver_service.track.relax import PassedOver, PathPass, clock_sigma_s, settled
 from buddyline.solver_service.track.smoother import Path, rows_between, smoothed
 from buddyline.solver_service.track.start import CLOCK_S
-from buddyline.solver_service.track.state import NAV
 from buddyline.solver_service.track.trail import Trail
 from buddyline.solver_service.track.vibration import Shares
 from buddyline.solver_service.track.walking import Walking, joint
@@ -77,8 +76,14 @@ class Smoothed:
     dark: list[tuple[int, int, float]] = field(default_factory=list)
 
 
-def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int], clock_ns: int = 0) -> Smoothed:
-    """Give the whole dive's track at outputs_ns."""
+def smooth(
+    records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int], clock_ns: int = 0, *, again: bool = True
+) -> Smoothed:
+    """Give the whole dive's track at outputs_ns.
+
+    clock_ns: how far B's clock is believed ahead. again: where the passes over the dive contradict the first one, begin
+    once more with the offset that they found, which is nearer than the first one's false one.
+    """
     records, fixes = (parted(in_order(records[0])), parted(in_order(records[1]))), sorted(fixes, key=stamp_of)
     told_ns = clock_ns
     long = bool(fixes) and fixes[-1].stamp_ns - fixes[0].stamp_ns > 2 * HEAD_NS
@@ -116,7 +121,7 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
     learned = replace(known, walking=joint([part.walking for part in parts]), unrest=unrest)
     found: list[tuple[PathPass, Path]] = []
     lost: list[str] = []
-    since_s = -math.inf
+    since_s, contradicting_ns = -math.inf, None
     for part in parts:
         path, shaking = smoothed(part.steps), part.shaking.less(shares)
         # Every step of the first pass holds a covariance: both passes at once take twice the memory.
@@ -130,23 +135,28 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
             told_by, by_first = sum(part.told_by), known if late else learned
             one = settled(about, part.detection, shaking, by_first, told_by, doubtful=late)
             limit_s = MOST_LEFT_S if about is path else NEAR_CLOCK_S
+            if one is None:
+                continue
+            passed_s, first_s = _clock_s(*one), clock_ns * 1e-9 + part.state.clock_s
             # What a late start tells of the clocks is little, and less than it believes.
-            if one is not None and (late or not _contradicts(one[1], part, limit_s)):
+            if late or abs(passed_s - first_s) < max(limit_s, TOLD_SIGMAS * clock_sigma_s(one[1])):
                 found.append(one)
                 break
+            contradicting_ns = round(passed_s * 1e9)
         else:
             span = f"no track for {lasted_s(part):.0f} s"
             lost.append(f"{first.both}: passes over the dive contradict the first one or do not settle: {span}")
+    if not found and again and contradicting_ns is not None:
+        return smooth(records, fixes, outputs_ns, contradicting_ns, again=False)
     if not found:
         return Smoothed([], clock_ns * 1e-9, math.inf, [*first.problems, *lost])
-    whole = _rows_of([track for track, _ in found], [path for _, path in found], outputs_ns)
+    whole = _rows_of(found, outputs_ns)
     return replace(whole, problems=[*whole.problems, *lost])
 
 
-def _contradicts(path: Path, first: Estimate, limit_s: float) -> bool:
-    """Whether a track's clocks are off what the first pass found by limit_s and TOLD_SIGMAS."""
-    sigma_s = math.sqrt(path.covariance(-1)[NAV, NAV])
-    return abs(path.state(-1).clock_s - first.state.clock_s) >= max(limit_s, TOLD_SIGMAS * sigma_s)
+def _clock_s(track: TrackFilter | PathPass, path: Path) -> float:
+    """Give how far B's clock is ahead, by a pass and its path."""
+    return track.clock_ns * 1e-9 + path.state(-1).clock_s
 
 
 def _of_one_lamp_each(known: PassedOver, part: Estimate, outputs_ns: Sequence[int]) -> Smoothed:
@@ -162,7 +172,7 @@ def _of_one_lamp_each(known: PassedOver, part: Estimate, outputs_ns: Sequence[in
     earlier = _path_before(known, path, -math.inf)
     if earlier is not None:
         track, path = settled(path.after(earlier), track.passed.detection, shaking, known, told, doubtful=True) or found
-    return _rows_of([track], [path], outputs_ns)
+    return _rows_of([(track, path)], outputs_ns)
 
 
 def _path_before(known: PassedOver, path: Path, since_s: float) -> Path | None:
@@ -189,7 +199,8 @@ def _first_pass(
 ) -> tuple[TrackFilter, list[Estimate], int]:
     """Give a filter that has passed over a dive up to stop_ns, its tracks, and how far B's clock was believed ahead.
 
-    Where that gives tracks in pieces other offsets are tried, and the one that explains most is taken.
+    Where that gives tracks in pieces other offsets are tried, and the one that explains most is taken. With units off
+    their mounts each round finds a part of the offset: what is left of it then is worth as many rounds again.
     """
     best = _rounds(records, fixes, clock_ns, stop_ns)
     for try_s in CLOCK_TRIES_S:
@@ -197,7 +208,8 @@ def _first_pass(
             break
         other = _rounds(records, fixes, clock_ns + round(try_s * 1e9), stop_ns)
         best = max(best, other, key=lambda found: sum(part.evidence for part in found[1]))
-    return best
+    left_ns = clock_left_ns(best[1])
+    return _rounds(records, fixes, best[2] + left_ns, stop_ns) if left_ns else best
 
 
 def _rounds(
@@ -225,19 +237,17 @@ def _smoothed(track: TrackFilter, parts: Sequence[Estimate], outputs_ns: Sequenc
     """Smooth each part."""
     paths = []
     for part in parts:
-        paths.append(smoothed(part.steps))
+        paths.append((track, smoothed(part.steps)))
         part.steps = Trail()
-    return _rows_of([track], paths, outputs_ns)
+    return _rows_of(paths, outputs_ns) if paths else Smoothed([], track.clock_ns * 1e-9, math.inf, track.problems)
 
 
-def _rows_of(tracks: Sequence[TrackFilter | PathPass], paths: Sequence[Path], outputs_ns: Sequence[int]) -> Smoothed:
+def _rows_of(passed: Sequence[tuple[TrackFilter | PathPass, Path]], outputs_ns: Sequence[int]) -> Smoothed:
     """Give the rows of last passes' paths."""
-    last, problems = tracks[-1], list(dict.fromkeys(said for track in tracks for said in track.problems))
-    if not paths:
-        return Smoothed([], last.clock_ns * 1e-9, math.inf, problems)
+    problems = list(dict.fromkeys(said for track, _ in passed for said in track.problems))
     stamps = sorted(outputs_ns)
-    times_s = np.array([last.between(stamp) for stamp in stamps])
-    clock_s = last.clock_ns * 1e-9 + paths[-1].state(-1).clock_s
-    sigma_s = math.sqrt(paths[-1].covariance(-1)[NAV, NAV])
-    rows = chain.from_iterable(rows_between(path, times_s, stamps) for path in paths)
-    return Smoothed(rows, clock_s, sigma_s, problems, last.lamps.dark())
+    rows = chain.from_iterable(
+        rows_between(path, np.array([track.between(stamp) for stamp in stamps]), stamps) for track, path in passed
+    )
+    last, path = passed[-1]
+    return Smoothed(rows, _clock_s(last, path), clock_sigma_s(path), problems, last.lamps.dark())

@@ -62,6 +62,11 @@ DOUBTFUL_SIGMAS: Final = 0.3
 LOOKED_AT: Final = 10
 UNFIT: Final = 1.5
 LEAST_TOLD: Final = 0.5
+# Where a dive's passes have settled with the clocks so far and so many sigmas off what they assumed, the dive is passed
+# over again with what they found: of an offset they find a part. Further off, the path is no place to be linear about.
+LEFT_CLOCK_S: Final = 0.002
+LEFT_SIGMAS: Final = 2.0
+FAR_CLOCK_S: Final = 0.02
 # Noise and units are judged by the samples of two seconds.
 KEPT_S: Final = 3.0
 
@@ -310,10 +315,20 @@ def settled(
         if not bool(np.isfinite(path.states).all()):
             return None
         if _stays(old, path, DOUBTFUL_SIGMAS if doubtful else STAYS_SIGMAS):
+            left_s = path.state(-1).clock_s
+            # What a doubtful track tells of the clocks is little, and less than it believes.
+            if not doubtful and max(LEFT_CLOCK_S, LEFT_SIGMAS * clock_sigma_s(path)) < abs(left_s) < FAR_CLOCK_S:
+                known, path = replace(known, clock_ns=known.clock_ns + round(left_s * 1e9)), path.later(left_s)
+                continue
             fits = passed.surprise < UNFIT * passed.told and sum(passed.told_by) > LEAST_TOLD * told
             near = np.linalg.norm(path.states[:, R_], axis=1).max() < FURTHEST_M
             return (track, path) if near and (fits or not doubtful) else None
     return None
+
+
+def clock_sigma_s(path: Path) -> float:
+    """Give 1 sd of the clocks' offset at a path's end."""
+    return math.sqrt(path.covariance(-1)[NAV, NAV])
 
 
 def _stays(old: Path, new: Path, sigmas: float) -> bool:

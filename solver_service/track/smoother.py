@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
@@ -12,7 +12,7 @@ from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rot
 from buddyline.solver_service.track.lights import COLUMNS
 from buddyline.solver_service.track.output import TrackRow, rows_of
 from buddyline.solver_service.track.shaking import SHAKEN_S
-from buddyline.solver_service.track.state import MOVING, NAV, PHI, R_, ROW, SHAKE, SHOVE, SIZE, V_, State
+from buddyline.solver_service.track.state import CLOCK_COLUMN, MOVING, NAV, PHI, R_, ROW, SHAKE, SHOVE, SIZE, V_, State
 from buddyline.solver_service.track.strapdown import predicted
 from buddyline.solver_service.track.trail import Look, Trail
 from numpy.typing import NDArray
@@ -56,6 +56,15 @@ class Path:
         columns = ("t_s", "light_s", "lights", "rates_radps", "states", "halves", "drawn", "without")
         both = {name: np.concatenate((getattr(earlier, name)[:-1], getattr(self, name))) for name in columns}
         return Path(**both, looks=[*earlier.looks[:-1], *self.looks], oldest=earlier.oldest)
+
+    def later(self, clock_s: float) -> Path:
+        """Give the path for one who believes B's clock to be so much further ahead."""
+        states = self.states.copy()
+        states[:, CLOCK_COLUMN] -= clock_s
+        looks = [
+            tuple(replace(look, t_s=look.t_s - clock_s) if look.node else look for look in seen) for seen in self.looks
+        ]
+        return replace(self, states=states, looks=looks)
 
     def state(self, k: int) -> State:
         """Give the state at a step."""

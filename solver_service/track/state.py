@@ -34,6 +34,7 @@ _SHAPES: Final = ((3,), (3,), (2, 3, 3), (2, 3), (3,), (2, 3), (2, 3), (2, 3), (
 _ENDS: Final = np.cumsum([math.prod(shape) for shape in _SHAPES]).tolist()
 _PARTS: Final = list(zip([0, *_ENDS], _ENDS, _SHAPES, strict=False))
 ROW: Final = _ENDS[-1]
+CLOCK_COLUMN: Final = ROW - 2
 _THREE: Final = 3.0 * np.eye(3)
 _STILL: Final[Floats] = np.eye(MOVING)
 _OF_PLACE: Final = np.r_[R_, PHI[0], PHI[1]]
