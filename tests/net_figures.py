@@ -5,9 +5,10 @@
     .venv/bin/python -m tests.net_figures --basin                        # a fixed pair of nodes and a moving one, 20 Hz
 
 The joint bound is what the same filter, or smoother, states when it is told the simulator's own sigmas of the units'
-biases, mounts, lever arms and delays. Its own errors over it stand beside ours: what they are above 1 is chance, which
-both share. The last node and b stand side by side, do not see each other, and are placed by others (`b-d`); their
-composed bound is that of both places together, as if independent. A dive of 10 s takes about a minute of CPU.
+biases and their walks, mounts, lever arms and delays. Its own errors over it, and its NEES, stand beside ours: by how
+far they are from 1 is chance, which both share. Gross errors of lights that pass add 0.03 to 0.08 to NEES. The last
+node and b stand side by side, do not see each other, and are placed by others (`b-d`); their composed bound is that of
+both places together, as if independent. A dive of 10 s takes about a quarter of a minute of CPU.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import sys
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 from unittest.mock import patch
 
@@ -31,16 +32,21 @@ from buddyline.protocol.messages import LightTruth, Message, NodePose, Truth
 from buddyline.solver_service.config import SolveConfig, track_settings
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, rotation_log
+from buddyline.solver_service.network import filter as net_filter
 from buddyline.solver_service.network import shaking, state
 from buddyline.solver_service.network.estimate import NetEstimate
 from buddyline.solver_service.network.rows import DueNetRow, plain_of_posed
 from buddyline.solver_service.network.state import POSED, NetState, block
 from buddyline.solver_service.network.trail import Told
+from buddyline.solver_service.track.samples import Samples
+from buddyline.solver_service.track.strapdown import Noise
 from buddyline.solver_service.tracking import Coming, PairTracker
 
 START_NS = 1_764_000_000_000_000_000
 # Beyond these a row is wrong, as `evaluate` has it.
 WRONG_M, WRONG_RAD = 0.3, 0.1
+# A bias's wandering part of 1 sd (node/sim/inertial.WALK_S) changes in 10 s by as much as a walk of this density.
+WALKED = 0.28
 FOUR = {"more_nodes": ("c", "d"), "fixed_nodes": ("a",)}
 # Nodes a and c stand, and b moves to 6 m away.
 BASIN = {"more_nodes": ("c",), "fixed_nodes": ("a", "c"), "environment": "basin", "range_max_m": 6.0}
@@ -93,10 +99,10 @@ class Pooled:
 
 @dataclass
 class Figures:
-    """The figures of one mode over all dives. nees: the mean of each node in each dive."""
+    """The figures of one mode over all dives. nees: ours and told, by dive: the mean of each node."""
 
     ratios: defaultdict[str, Pooled] = field(default_factory=lambda: defaultdict(Pooled))
-    nees: list[float] = field(default_factory=list)
+    nees: defaultdict[str, list[list[float]]] = field(default_factory=lambda: defaultdict(list))
     wrong: int = 0
     rows: int = 0
 
@@ -104,6 +110,12 @@ class Figures:
 @contextmanager
 def told(grade: Grade) -> Iterator[None]:
     """Tell the network the simulator's own sigmas; a unit that nothing shakes is known not to be shaken."""
+
+    def noise(self: Samples, time_s: float) -> Noise:
+        gyro, accel = WALKED * grade.gyro_walk_radps, WALKED * grade.accel_walk_mps2
+        return replace(sampled(self, time_s), gyro_bias_radps=gyro, accel_bias_mps2=accel)
+
+    sampled = Samples.noise
     least_s, most_s = (ns * 1e-9 for ns in grade.delay_ns)
     sigmas = {
         "GYRO_BIAS_RADPS": math.hypot(grade.gyro_bias_radps, grade.gyro_walk_radps),
@@ -116,7 +128,13 @@ def told(grade: Grade) -> Iterator[None]:
     if not grade.shake_radps:
         still = np.full(2, 2.0 * math.log(1e-6))
         shaken = {"SHAKE_RAD": 1e-6, "SHOVE_MPS": 1e-6, "_BOUNDS": (still, still)}
-    with patch.multiple(state, **sigmas), patch.multiple(shaking, **shaken) if shaken else nullcontext():
+    with (
+        patch.multiple(state, **sigmas),
+        patch.multiple(shaking, **shaken) if shaken else nullcontext(),
+        patch.object(Samples, "noise", noise),
+        # The walks are known, so that no others are tried.
+        patch.object(net_filter, "WALKS", np.ones(1)),
+    ):
         yield
 
 
@@ -196,6 +214,8 @@ def compare(world: World, ours: NetRun, best: NetRun, nodes: tuple[str, str], fi
     """Add one dive's figures, and return them as a line."""
     found, bound = errors_of(world, ours), errors_of(world, best)
     for name, run in (("place", found), ("told", bound)):
+        of_mode = figures.nees["NEES/6" if run is found else "told, NEES/6"]
+        of_mode.append([float(one.nees.mean()) for one in run.values()])
         for node in run.keys() & bound.keys():
             figures.ratios[f"{name}, RMS / bound"].add(run[node].squared_m2, bound[node].variance_m2)
     ways, least = between(world, ours, *nodes), between(world, best, *nodes)
@@ -216,7 +236,6 @@ def compare(world: World, ours: NetRun, best: NetRun, nodes: tuple[str, str], fi
             f"  {node}: median {median_mm:.1f} mm, 95 % {off_mm:.1f}, RMS {rms_mm:.1f}, sigma {sigma_mm:.1f}, "
             f"turn {turn_deg:.3f} deg, NEES/6 {one.nees.mean():.2f}, wrong {one.wrong} of {len(one.nees)}"
         )
-        figures.nees.append(float(one.nees.mean()))
         figures.wrong += one.wrong
         figures.rows += len(one.nees)
     return "\n".join(lines)
@@ -247,7 +266,11 @@ def main() -> int:
         print(f"{mode}: {len(args.seeds)} dives of {args.seconds:g} s; in brackets single ones, least and greatest")
         for name, ratio in of.ratios.items():
             print(f"  {name:28} {ratio}")
-        print(f"  {'NEES/6':28} {np.mean(of.nees):5.2f} ({min(of.nees):.2f} to {max(of.nees):.2f})")
+        for name, dives in of.nees.items():
+            every = [one for dive in dives for one in dive]
+            # Nodes of one dive err alike: only dives are independent.
+            chance = float(np.std([np.mean(dive) for dive in dives])) / math.sqrt(max(len(dives) - 1, 1))
+            print(f"  {name:28} {np.mean(every):5.2f} +- {chance:.2f} ({min(every):.2f} to {max(every):.2f})")
         print(f"  {'wrong':28} {of.wrong} of {of.rows}")
     return 1 if any(of.wrong > 0.001 * of.rows for of in figures.values()) else 0
 

@@ -1,21 +1,35 @@
 """What `tests.net_figures` tells the network of each grade of units; `python -m tests.net_figures` takes minutes."""
 
-import pytest
-from buddyline.node.sim.inertial import GRADES
-from buddyline.solver_service.network import shaking, state
+import math
 
-from tests.net_figures import told
+import numpy as np
+import pytest
+from buddyline.node.sim.inertial import GRADES, WALK_S
+from buddyline.node.sim.randomness import Sway
+from buddyline.solver_service.network import shaking, state
+from buddyline.solver_service.track.samples import Samples
+
+from tests.net_figures import WALKED, told
 
 
 def sigmas():
-    return state.LEVER_TOLD_M, shaking.SHAKE_RAD
+    return state.LEVER_TOLD_M, shaking.SHAKE_RAD, Samples().noise(0.0).gyro_bias_radps
 
 
 @pytest.mark.parametrize("name", GRADES)
 def test_the_simulators_own_sigmas_are_told_and_taken_back(name):
-    lever_m, shake_rad = before = sigmas()
+    lever_m, shake_rad, _ = before = sigmas()
     grade = GRADES[name]
     with told(grade):
-        assert sigmas() == (grade.lever_sigma_m, shake_rad if grade.shake_radps else 1e-6)
+        shaken_rad = shake_rad if grade.shake_radps else 1e-6
+        assert sigmas() == (grade.lever_sigma_m, shaken_rad, WALKED * grade.gyro_walk_radps)
     assert lever_m != grade.lever_sigma_m
     assert sigmas() == before
+
+
+def test_the_walk_told_is_that_of_the_simulators_biases():
+    """Over 10 s, of 300 biases' wandering parts of 1 sd."""
+    rng = np.random.default_rng(1)
+    sways = [Sway(rng, *WALK_S, 6) for _ in range(300)]
+    changes = [(sway(t_s + 10.0) - sway(t_s)) / sway.sd for sway in sways for t_s in np.arange(0.0, 600.0, 20.0)]
+    assert np.std(changes) == pytest.approx(WALKED * math.sqrt(10.0), rel=0.1)

@@ -7,7 +7,7 @@ A's.
 
 from __future__ import annotations
 
-from typing import Literal, TypeAlias
+from typing import Final, Literal, TypeAlias
 
 import numpy as np
 from buddyline.node.capture.exposure import Exposure
@@ -15,6 +15,7 @@ from buddyline.node.sim import candidates, rotation, tags
 from buddyline.node.sim.glow import core_px
 from buddyline.node.sim.inertial import STEP_S
 from buddyline.node.sim.picture import Painter
+from buddyline.node.sim.randomness import generator
 from buddyline.node.sim.rig import LEFT, Q_BODY_CAMERA, R_BODY_CAMERA, RIGHT
 from buddyline.node.sim.rotation import Matrix, Vector
 from buddyline.node.sim.scenario import Scenario
@@ -41,6 +42,9 @@ from numpy.typing import NDArray
 Triple: TypeAlias = tuple[float, float, float]
 
 SOFTWARE = "buddyline simulator"
+# Of a fixed node's stated place and attitude, 1 sd of each coordinate.
+SURVEY_SIGMA_M: Final = 1e-4
+SURVEY_SIGMA_RAD: Final = 1e-4
 
 
 class World:
@@ -78,9 +82,15 @@ class World:
         )
 
     def _place(self, node: str, stamp_ns: int) -> FixedPlace:
-        """Return where a fixed node stands, surveyed without an error."""
+        """Return where a fixed node stands by its survey, which is off as its sigmas say."""
         R, position_m = self.T_ned_camera(node, stamp_ns)
-        return FixedPlace(p_m=_triple(position_m), q_xyzw=rotation.to_quaternion(R), sigma_m=1e-4, sigma_rad=1e-4)
+        off = generator(self.scenario.seed, "survey", self.scenario.index(node)).standard_normal(6)
+        return FixedPlace(
+            p_m=_triple(position_m + SURVEY_SIGMA_M * off[:3]),
+            q_xyzw=rotation.to_quaternion(rotation.from_euler(*(SURVEY_SIGMA_RAD * off[3:])) @ R),
+            sigma_m=SURVEY_SIGMA_M,
+            sigma_rad=SURVEY_SIGMA_RAD,
+        )
 
     def T_ned_camera(self, node: str, stamp_ns: int) -> tuple[Matrix, Vector]:
         """Return R (3, 3) and t (3,), metres: from a node's camera frame to NED, with its origin at the surface."""

@@ -362,3 +362,19 @@ def test_a_blinking_lamp_is_dark_by_its_own_nodes_clock(offset_ns):
         assert lights["left"] == lit(blink, stamp_ns + offset_ns)[0]
         seen.append(lights["left"])
     assert seen.count(False) == 6
+
+
+def test_a_fixed_nodes_survey_is_off_as_its_sigmas_say():
+    """Over 40 worlds of two fixed nodes: each of 240 errors of the place, and of the attitude, over its sigma."""
+    places, turns = [], []
+    for seed in range(40):
+        world = World(Scenario(seed=seed, start_ns=START_NS, fixed_nodes=("a", "b")))
+        for node in "ab":
+            fixed = world.info(node, START_NS, S_NS).fixed
+            true = world.node_truth(node, START_NS, "main")
+            turn = rotation.from_quaternion(true.q_xyzw) @ rotation.from_quaternion(fixed.q_xyzw).T
+            places.append((np.array(true.p_m) - fixed.p_m) / fixed.sigma_m)
+            turns.append(rotation.to_vector(turn) / fixed.sigma_rad)
+    # 1 +- 0.15 is over 3 sd of the chance of 240.
+    assert np.std(places) == pytest.approx(1.0, abs=0.15)
+    assert np.std(turns) == pytest.approx(1.0, abs=0.15)
