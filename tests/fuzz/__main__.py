@@ -1,4 +1,4 @@
-"""Fuzz for as long as one likes: `python -m tests.fuzz --minutes 10 [ros digests decoders logs configuration solver]`.
+"""Fuzz for as long as one likes: `python -m tests.fuzz --minutes 10 [ros digests ...]`, of the targets named.
 
 Prints a line a target: how many cases, and how many different failures; each failure once, with its input.
 """
@@ -14,7 +14,7 @@ import traceback
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 
-from tests.fuzz.targets import TARGETS
+from tests.fuzz.clients import ALL_TARGETS
 
 BATCH = 200
 # Shrinking a failing case takes longer than finding it; its seed finds it again.
@@ -29,7 +29,7 @@ def fuzz(name: str, seconds: float, first_seed: int) -> tuple[int, set[str]]:
     def target(data: st.DataObject) -> None:
         nonlocal cases
         cases += 1
-        TARGETS[name](data)
+        ALL_TARGETS[name](data)
 
     ends_s = time.monotonic() + seconds
     number = first_seed
@@ -53,12 +53,12 @@ def fuzz(name: str, seconds: float, first_seed: int) -> tuple[int, set[str]]:
 def main() -> int:
     """Run; 1 where anything failed."""
     parser = argparse.ArgumentParser(prog="tests.fuzz", description=__doc__)
-    parser.add_argument("targets", nargs="*", choices=[*TARGETS, []], help="all, where none is named")
+    parser.add_argument("targets", nargs="*", choices=[*ALL_TARGETS, []], help="all, where none is named")
     parser.add_argument("--minutes", type=float, default=10.0, help="in all; default: 10")
     parser.add_argument("--seed", type=int, default=0, help="of the first batch; default: 0")
     args = parser.parse_args()
     logging.disable(logging.WARNING)
-    names = args.targets or list(TARGETS)
+    names = args.targets or list(ALL_TARGETS)
     failed = 0
     for name in names:
         cases, failures = fuzz(name, 60 * args.minutes / len(names), args.seed)

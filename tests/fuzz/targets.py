@@ -258,7 +258,7 @@ def hostile_streams(draw: st.DrawFn) -> list[tuple[str, bytes]]:
         how = draw(st.sampled_from(["extreme", "extreme", "again", "ahead"]))
         payload = encode(message)
         if how == "extreme":
-            payload = draw(_extreme(message))
+            payload = draw(extreme(message))
         elif how == "ahead":
             more = {"trigger": message.trigger + 36_000} if isinstance(message, Candidates) else {}
             payload = encode(msgspec.structs.replace(message, stamp_ns=message.stamp_ns + 3_600_000_000_000, **more))
@@ -271,7 +271,7 @@ def hostile_streams(draw: st.DrawFn) -> list[tuple[str, bytes]]:
 
 
 @st.composite
-def _extreme(draw: st.DrawFn, message: Message) -> bytes:
+def extreme(draw: st.DrawFn, message: Message) -> bytes:
     tree = json.loads(encode(message))
     for _ in range(draw(st.integers(1, 4))):
         places = [(at, key) for at, key in _places(tree) if isinstance(at[key], float)]
@@ -328,11 +328,11 @@ def fuzz_solver(data: st.DataObject) -> None:
 
 @functools.cache
 def _translation() -> Translation:
-    return Translation(_store().types)
+    return Translation(ros_types().types)
 
 
 @functools.cache
-def _store() -> Any:
+def ros_types() -> Any:
     return type_store()
 
 
@@ -341,7 +341,7 @@ def fuzz_ros(data: st.DataObject) -> None:
     message = data.draw(st.sampled_from(SOUND))
     with contextlib.suppress(MessageError):
         for one in _translation().messages(decode(data.draw(spoilt_payloads(message)), type(message))):
-            _store().serialize_cdr(one.value, one.type_name)
+            ros_types().serialize_cdr(one.value, one.type_name)
 
 
 def fuzz_digests(data: st.DataObject) -> None:

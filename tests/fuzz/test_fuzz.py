@@ -4,14 +4,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.fuzz.targets import TARGETS
+from tests.fuzz.clients import ALL_TARGETS
 
-EXAMPLES = {"ros": 60, "digests": 60, "decoders": 200, "logs": 25, "configuration": 150, "solver": 10}
+EXAMPLES = {"ros": 60, "digests": 60, "decoders": 200, "logs": 25, "configuration": 150, "solver": 10, "clients": 15}
 
 
-@pytest.mark.parametrize("name", TARGETS)
+@pytest.mark.parametrize("name", ALL_TARGETS)
 def test_nothing_but_known_errors_comes_out(name):
     run = settings(
         max_examples=EXAMPLES[name], deadline=None, derandomize=True, database=None, suppress_health_check=HealthCheck
-    )(given(data=st.data())(TARGETS[name]))
+    )(given(data=st.data())(ALL_TARGETS[name]))
     run()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -90,6 +91,21 @@ class TestPlacing:
         assert "attitude of node a" in placing.why
         assert take(placing, oriented(), estimate()) is not None
         assert placing.why == ""
+
+    @pytest.mark.parametrize(
+        "absurd",
+        [
+            {"t_a_b_m": (0.0, 0.0, 1e39)},
+            {"v_a_b_mps": (1e39, 0.0, 0.0)},
+            {"covariance": [1e39] * 36},
+            {"v_covariance": [1e39] * 9},
+        ],
+    )
+    def test_numbers_that_no_receiver_can_take_are_no_place(self, absurd: dict[str, Any]) -> None:
+        placing = Placing("b")
+        assert take(placing, *INFOS.values(), oriented(), replace(estimate(), **absurd)) is None
+        assert "out of numeric range" in placing.why
+        assert take(placing, oriented(6), estimate(6)) is not None
 
     def test_poses_count_only_where_no_track_is_fresh_and_the_late_track_never(self) -> None:
         placing = Placing("b")

@@ -14,7 +14,7 @@ from buddyline.protocol.clock import S_NS, ManualClock
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message, NodePose
 from buddyline.solver_service.geometry.rotation import quat_to_matrix
-from buddyline.tools.export.ros_messages import MAP, RosMessage, Translation, name_of, type_store
+from buddyline.tools.export.ros_messages import MAP, RANGE_TYPE, RosMessage, Translation, name_of, type_store
 from buddyline.tools.ros2 import RosGraph, attachment, dds_type
 from msgspec.structs import replace
 
@@ -71,6 +71,13 @@ def test_an_absurd_sigma_gives_a_finite_variance(store: Any) -> None:
     messages = translated(store, *absurd)
     assert np.isfinite(of(messages, "/buddyline/a/depth").pose.covariance).all()
     assert np.isfinite(of(messages, "/buddyline/a/attitude").orientation_covariance).all()
+
+
+@pytest.mark.parametrize("absurd", [{"range_m": 1e308}, {"covariance": [1e80] * 36}])
+def test_an_absurd_range_can_be_sent(store: Any, absurd: dict[str, Any]) -> None:
+    """ROS has both numbers in single precision."""
+    value = of(translated(store, replace(pose(0), **absurd)), "/buddyline/a/b/range")
+    assert store.serialize_cdr(value, RANGE_TYPE)
 
 
 def test_a_pose_is_published_unchanged_with_its_covariance(store: Any) -> None:

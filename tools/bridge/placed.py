@@ -24,6 +24,8 @@ from buddyline.tools.estimate import Estimate
 # An estimate whose position has this share of the range for its sigma is worth nothing: no track is published there.
 WORTHLESS_SHARE: Final = 0.2
 MIN_RANGE_M: Final = 0.1
+# Of a position (m) and a velocity (m/s). Numbers of MAVLink are of single precision, and an autopilot squares them.
+MOST: Final = 1e5
 
 
 @dataclass(frozen=True)
@@ -230,7 +232,7 @@ class Placing:
         self._last_ns = stamp_ns
         if not placed.is_north_true and self._declination_rad is not None:
             placed = placed.with_true_north(self._declination_rad)
-        if not all(np.isfinite(values).all() for values in (placed.p_ned_m, placed.R_ned_body, placed.covariance)):
+        if not _is_sound(placed):
             self.why = "the estimate is out of numeric range"
             return None
         self.why = ""
@@ -238,6 +240,17 @@ class Placing:
             (stream.newest_ns for stream in self._attitudes.values() if stream.newest_ns is not None), default=stamp_ns
         )
         return replace(placed, depth_m=self._depth_m, restarts=self._restarts, behind_s=(newest_ns - stamp_ns) / S_NS)
+
+
+def _is_sound(placed: Placed) -> bool:
+    """Return whether all numbers are finite, and such that every receiver's format can say them."""
+    lengths = [values for values in (placed.p_ned_m, placed.v_ned_mps) if values is not None]
+    squares = [values for values in (placed.covariance, placed.v_covariance) if values is not None]
+    return (
+        all(bool((np.abs(values) <= MOST).all()) for values in lengths)
+        and all(bool((np.abs(values) <= MOST**2).all()) for values in squares)
+        and bool(np.isfinite(placed.R_ned_body).all())
+    )
 
 
 def _about_down(angle_rad: float) -> Floats:

@@ -43,6 +43,8 @@ R_FRD_FLU: Final = np.diag([1.0, -1.0, -1.0])
 UNKNOWN_VARIANCE: Final = 1e6
 # A greater one has no finite square.
 MOST_SIGMA: Final = 1e150
+# Range has numbers of single precision.
+MOST_SINGLE: Final = float(np.finfo(np.float32).max)
 
 POSE_TYPE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
 ODOMETRY_TYPE: Final = "nav_msgs/msg/Odometry"
@@ -180,8 +182,8 @@ class Translation:
             field_of_view=0.0,
             min_range=MIN_RANGE_M,
             max_range=MAX_RANGE_M,
-            range=estimate.range_m,
-            variance=min(range_sigma_m(estimate), MOST_SIGMA) ** 2,
+            range=min(estimate.range_m, MOST_SINGLE),
+            variance=min(min(range_sigma_m(estimate), MOST_SIGMA) ** 2, MOST_SINGLE),
         )
         return RosMessage(f"/buddyline/{a}/{b}/range", RANGE_TYPE, value)
 
