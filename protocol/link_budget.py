@@ -84,10 +84,11 @@ class LinkBudget:
     def admits_copy(self, size_bytes: int, now_s: float) -> bool:
         """Return whether to send a copy of a message as a datagram; if so, count it as sent.
 
-        A copy only counts as the next message: behind a full connection it would take that one's room for nothing.
+        A copy only counts as the next message: behind a full connection it would take that one's room for nothing. But
+        where a lost packet has stopped the connection, for seconds, copies are all that arrives.
         """
         with self._lock:
-            if self._limit is None or self._is_behind(now_s):
+            if self._limit is None or (self._is_behind(now_s) and not self._is_stopped()):
                 return False
             self._refill(now_s, self._limit)
             self._spend(float(size_bytes + OVERHEAD_BYTES))
@@ -178,6 +179,10 @@ class LinkBudget:
 
     def _is_behind(self, now_s: float) -> bool:
         return now_s - self._clear_s > BEHIND_S
+
+    def _is_stopped(self) -> bool:
+        """Return whether hardly anything was acknowledged of late: not more than a packet."""
+        return not self._seen or self._seen[-1][2].acked - self._seen[0][2].acked < FULL_BYTES
 
     def _spend(self, cost: float) -> None:
         """Count bytes as sent. At most a second's budget is owed."""

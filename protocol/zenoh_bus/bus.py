@@ -203,12 +203,14 @@ class ZenohBus(Bus):
             self._link.flush()
             twice.append((payload, source))
             size_bytes = sum(len(one) for one, _ in twice)
-            if self._link.is_long and self._budget.admits_copy(size_bytes, time.monotonic()):
-                self._datagrams.open()
-                if self._datagrams.session is not None:
-                    for one, of in twice:
-                        express = {"express": one is payload}
-                        self._datagrams.session.put(key, one, source_info=of, attachment=COPY, **settings | express)
+            if not self._link.is_long:
+                return
+            # Before there is need for it: on a full link that would take long.
+            self._datagrams.open()
+            datagrams = self._datagrams.session
+            if datagrams is not None and self._budget.admits_copy(size_bytes, time.monotonic()):
+                for one, of in twice:
+                    datagrams.put(key, one, source_info=of, attachment=COPY, **settings | {"express": one is payload})
 
         # What the hub retains is answered by the hub.
         answer_in = self._session if topic.latest_only and not topic.retained else None

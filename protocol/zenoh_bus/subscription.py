@@ -26,6 +26,8 @@ from buddyline.protocol.zenoh_bus.session import RETRY_S
 COPY: Final = b"copy"
 AGAIN: Final = b"again"
 QUERY_S: Final = 2.0
+# A question about a gap: on a full link it, and its answer, wait in the queues of modems.
+FETCH_S: Final = 4.0
 # Gaps that are fetched at a time, each in a thread: of one owner of keys (protocol.sequence), and of all. An owner's
 # others wait: a link that lost a moment of a solver's outcomes lost those of many pairs.
 MAX_OWNER_GAPS: Final = 8
@@ -240,7 +242,7 @@ class ZenohSubscription:
         missing, found = set(gap.missing), dict[int, Arrived]()
         for _ in range(FETCHES):
             selector = f"{source.key}{_ADV}{source.zid}/{source.eid}/**?_sn={min(missing)}..{max(missing)}"
-            oldest, answer = self._query(selector)
+            oldest, answer = self._query(selector, FETCH_S)
             # An answer on another's key says nothing of this publisher.
             found.update((one.number, one) for one in answer if one.source == source and one.number is not None)
             missing = {number for number in missing if number not in found and number >= oldest.get(source, 0)}
@@ -254,7 +256,7 @@ class ZenohSubscription:
         if self._on_arrival is not None:
             self._on_arrival(arrived.source.key, arrived.payload)
 
-    def _query(self, selector: str) -> tuple[dict[PublisherId, int], list[Arrived]]:
+    def _query(self, selector: str, timeout_s: float = QUERY_S) -> tuple[dict[PublisherId, int], list[Arrived]]:
         """Return the numbers of the oldest messages that there are, by publisher, and the messages that they answer."""
         oldest: dict[PublisherId, int] = {}
         found: list[Arrived] = []
@@ -263,7 +265,7 @@ class ZenohSubscription:
             zenoh.handlers.FifoChannel(PAGES),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=QUERY_S,
+            timeout=timeout_s,
             cancellation_token=self._asking,
         ):
             source = None if reply.ok is None else _publisher_at(str(reply.ok.key_expr))

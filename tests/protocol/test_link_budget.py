@@ -116,9 +116,23 @@ def test_copies_go_on_a_slow_link_that_is_not_behind() -> None:
         budget.observe(TcpState(0, 0, 0, 0, 0.4), 25.0 + step / 10)
     assert budget.admits_copy(1000, 27.0)
     for step in range(20):
-        budget.observe(TcpState(0, 4096, 0, 0, 0.4), 27.0 + step / 10)
+        budget.observe(TcpState(1000 * step, 4096, 0, 0, 0.4), 27.0 + step / 10)
     assert not budget.admits_copy(1000, 29.0)
     assert "messages wait for more than 1 s, for 2 s now" in budget.words(29.0)
+
+
+def test_copies_go_on_beside_a_connection_that_a_lost_packet_has_stopped() -> None:
+    budget = LinkBudget()
+    run(12e3, 20.0, budget)
+    copied = []
+    for step in range(40):
+        now_s = 20.0 + step / 10
+        # After a second and a half it carries four bytes at a time.
+        budget.observe(TcpState(10**6 + min(1000 * step, 15_000) + 4 * step, 4096, 0, 0, 0.4), now_s)
+        copied.append(budget.admits_copy(1000, now_s))
+    assert copied[0]
+    assert not any(copied[12:32])
+    assert all(copied[35:])
 
 
 def clear(budget: LinkBudget, seconds: float, start_s: float, waiting: int = 0) -> float:
