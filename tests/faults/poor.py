@@ -178,6 +178,7 @@ def main() -> int:
                 process.end()
                 print("\n".join(f"{name}: {line}" for line in process.lines[-12:]), file=sys.stderr)
         later = times([directory / "recorder.mcap"])
+    print(f"the machine passed {tether.late:.1%} of the packets late", file=sys.stderr)
     print(markdown_table(HEAD, [row.cells() for row in rows(nodes, live)]))
     print(
         f"filled after {filled_s:.0f} s: "

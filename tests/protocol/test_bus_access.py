@@ -228,6 +228,88 @@ def test_nobody_can_mute_another_by_stating_its_source(keys: Path, role: str, ow
         forger.close()  # type: ignore[no-untyped-call]
 
 
+# The table in protocol/README.md: what each role may publish, of the keys below.
+OWN_KEYS: dict[str, Callable[[str], bool]] = {
+    "node-a": lambda key: key.startswith("node/a/") and not key.endswith("/expect"),
+    "solver": lambda key: key.startswith("pair/a/b/") or key in ("net/main/a", "net/main/b") or key.endswith("/expect"),
+    "viewer": lambda _: False,
+    "surveyor": lambda key: key.startswith("node/") and key.endswith("/mark"),
+    "player": lambda key: (
+        (key.startswith("node/") and not key.endswith(("/expect", "/log")))
+        or key in ("pair/a/b/truth", "pair/a/b/artag", "net/main/truth/a", "net/main/truth/b")
+    ),
+    "ros2": lambda _: False,
+}
+ALIVE_AS = {"node-a": "node/a", "solver": "solver", "viewer": "viewer", "surveyor": "surveyor", "player": "player"}
+
+
+@pytest.mark.parametrize("role", OWN_KEYS)
+def test_no_role_gets_anything_onto_another_s_keys(keys: Path, role: str) -> None:
+    """Every role, every key: puts, deletes, heartbeats, answers and tokens in another's name."""
+    templates = [topics.LOG, *(topic.template for topic in topics.TOPICS)]
+    every = {
+        template.format(node=node, a="a", b="b", net="main").removeprefix("buddyline/")
+        for template in templates
+        for node in "ab"
+    }
+    own = {key for key in every if OWN_KEYS[role](key)}
+    strange = ["buddyline/any", "any", "x/buddyline/node/b/candidates", "buddyline/node/b/candidates/more"]
+    endpoint = tls_endpoint()
+    with (
+        open_hub(endpoint, tls=tls(keys, "hub"), access=access_rules(["a", "b"])),
+        raw(endpoint, tls(keys, "viewer")) as watcher,
+        raw(endpoint, tls(keys, role)) as client,
+    ):
+        heard: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+        alive: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+        watched = [watcher.declare_subscriber(f"buddyline/{end}", heard.put) for end in ("**", "**/@adv/**")]
+        watched.append(watcher.liveliness().declare_subscriber("buddyline/@alive/**", alive.put))
+        foreign = [f"buddyline/{key}" for key in sorted(every - own)] + strange
+        mine = [f"buddyline/{key}" for key in sorted(own)]
+        beside = f"@adv/pub/{watcher.zid()}/1/_"
+
+        def answer(query: zenoh.Query) -> None:
+            for key in (*foreign, *mine):
+                query.reply(key, b"answer")
+                query.reply(f"{key}/{beside}", b"answer")
+
+        # Foreign ones first: of one session, if they passed, they would arrive first.
+        kept: list[object] = []
+        for key in (*foreign, *mine):
+            client.put(key, b"x")
+            client.put(key, b"x", source_info=zenoh.SourceInfo(client.declare_publisher(key).id, 1000))
+            client.delete(key)
+            client.put(f"{key}/{beside}", (9).to_bytes(4, "little"))
+            kept += [client.declare_queryable(key, answer), client.declare_queryable(f"{key}/{beside}", answer)]
+        kept.append(client.declare_queryable("buddyline/**", answer))
+        tokens = [f"buddyline/@alive/{name}/z" for name in (*ALIVE_AS.values(), "node/b") if name != ALIVE_AS.get(role)]
+        kept += [client.liveliness().declare_token(token) for token in tokens]
+        expected = {*mine, *(f"{key}/{beside}" for key in mine)}
+        said: set[str] = set()
+        while said < expected:
+            said.add(str(heard.get(timeout=PATIENCE_S).key_expr))
+        if role in ALIVE_AS:
+            token = f"buddyline/@alive/{ALIVE_AS[role]}/z"
+            kept.append(client.liveliness().declare_token(token))
+            assert str(alive.get(timeout=PATIENCE_S).key_expr) == token
+        # A question and its answers go the whole way after all that was said.
+        answered = {
+            str(reply.ok.key_expr)
+            for end in ("**", "**/@adv/**")
+            for reply in watcher.get(
+                f"buddyline/{end}", target=zenoh.QueryTarget.ALL, accept_replies=zenoh.ReplyKeyExpr.ANY
+            )
+            if reply.ok is not None
+        }
+        while not heard.empty():
+            said.add(str(heard.get().key_expr))
+        del watched, kept
+        assert said == expected
+        assert alive.empty()
+        assert answered <= expected
+        assert bool(answered) == bool(mine)
+
+
 def test_marks_and_stored_dives_reach_a_secured_hub_with_the_right_certificate_alone(
     keys: Path, tmp_path: Path
 ) -> None:
