@@ -16,6 +16,8 @@ MAX_OWNERS: Final = 256
 MAX_PUBLISHERS: Final = 256
 MAX_HELD: Final = 8192
 MAX_HELD_BYTES: Final = 16 * 1024 * 1024
+# Of a publisher: a connection that has lost a packet stands still for seconds.
+MAX_COPIES: Final = 256
 OWNER_CHUNKS: Final = 3
 
 S = TypeVar("S")
@@ -58,7 +60,8 @@ class Gap:
 class _Sender(Generic[S]):
     """The next expected number of a publisher, and its samples that arrived after a gap that is still open.
 
-    announced: the number in its last heartbeat.
+    announced: the number in its last heartbeat. held: number, sample and size. copies: of samples that have not come,
+    and are not the next; sample and size by number.
     """
 
     due: int
@@ -66,6 +69,7 @@ class _Sender(Generic[S]):
     open: bool = False
     announced: int = -1
     held: list[tuple[int, S, int]] = field(default_factory=list)
+    copies: dict[int, tuple[S, int]] = field(default_factory=dict)
 
 
 class SampleSequence(Generic[S]):
@@ -114,7 +118,9 @@ class SampleSequence(Generic[S]):
             publisher.open = True
             self._hold(source, publisher, number, sample, size_bytes)
             return Gap(source, missing, publisher.known)
+        self._pass_copies(source, publisher, before=number)
         self._pass(publisher, number, sample)
+        self._pass_copies(source, publisher)
         return None
 
     def skip(self, source: PublisherId, number: int) -> None:
@@ -123,11 +129,20 @@ class SampleSequence(Generic[S]):
         if not publisher.open and number >= publisher.due:
             publisher.due = number + 1
 
-    def accept_copy(self, source: PublisherId, number: int, sample: S) -> None:
-        """Deliver a copy that has come by another way, if it is the next; its original comes too."""
+    def accept_copy(self, source: PublisherId, number: int, sample: S, *, size_bytes: int = 0) -> None:
+        """Deliver a copy that has come by another way, in its order. Its original comes too, maybe much later.
+
+        So a copy opens no gap: it waits for what is before it.
+        """
         publisher = self._publishers.get(source.owner, {}).get(source)
-        if publisher is not None and not publisher.open and number == publisher.due:
+        if publisher is None or number < publisher.due or number in publisher.copies:
+            return
+        if number == publisher.due and not publisher.open:
             self._pass(publisher, number, sample)
+            self._pass_copies(source, publisher)
+        elif len(publisher.copies) < MAX_COPIES and self._has_room(source.owner, size_bytes):
+            publisher.copies[number] = sample, size_bytes
+            self._add_held(source.owner, size_bytes)
 
     def heartbeat(self, source: PublisherId, last: int, *, newest_only: bool = False) -> Gap | None:
         """Take a heartbeat, which has the publisher's last number so far; return the gap that it shows, if any.
@@ -149,10 +164,11 @@ class SampleSequence(Generic[S]):
         if publisher is None or not publisher.open:
             return None
         held, publisher.held = publisher.held, []
-        self._held_bytes[gap.source.owner] = self._held_bytes.get(gap.source.owner, 0) - sum(one[2] for one in held)
+        self._add_held(gap.source.owner, -sum(size for *_, size in held))
         end = gap.missing[-1]
         fetched = [(number, sample, 0) for number, sample in found if number in gap.missing]
-        waiting = sorted([*fetched, *held], key=lambda one: one[0])
+        copied = [(number, sample, 0) for number, (sample, _) in publisher.copies.items() if number <= end]
+        waiting = sorted([*fetched, *copied, *held], key=lambda one: one[0])
         for position, (number, sample, _) in enumerate(waiting):
             if number > end:
                 self._skip(publisher, end + 1)
@@ -164,6 +180,7 @@ class SampleSequence(Generic[S]):
                 self._pass(publisher, number, sample)
         self._skip(publisher, end + 1)
         publisher.open = False
+        self._pass_copies(gap.source, publisher)
         return None
 
     def _sender(self, source: PublisherId, new: _Sender[S]) -> _Sender[S]:
@@ -178,15 +195,31 @@ class SampleSequence(Generic[S]):
         others[source] = sender
         if len(others) > MAX_PUBLISHERS:
             gone = others.pop(next(iter(others)))
-            self._held_bytes[source.owner] = self._held_bytes.get(source.owner, 0) - sum(one[2] for one in gone.held)
+            sizes = [*(size for *_, size in gone.held), *(size for _, size in gone.copies.values())]
+            self._add_held(source.owner, -sum(sizes))
         return sender
 
     def _hold(self, source: PublisherId, publisher: _Sender[S], number: int, sample: S, size_bytes: int) -> None:
-        held_bytes = self._held_bytes.setdefault(source.owner, 0)
-        if len(publisher.held) >= MAX_HELD or (publisher.held and held_bytes + size_bytes > MAX_HELD_BYTES):
+        if len(publisher.held) >= MAX_HELD or (publisher.held and not self._has_room(source.owner, size_bytes)):
             return
         publisher.held.append((number, sample, size_bytes))
-        self._held_bytes[source.owner] = held_bytes + size_bytes
+        self._add_held(source.owner, size_bytes)
+
+    def _has_room(self, owner: str, size_bytes: int) -> bool:
+        return self._held_bytes.get(owner, 0) + size_bytes <= MAX_HELD_BYTES
+
+    def _add_held(self, owner: str, size_bytes: int) -> None:
+        self._held_bytes[owner] = self._held_bytes.get(owner, 0) + size_bytes
+
+    def _pass_copies(self, source: PublisherId, publisher: _Sender[S], before: int = 0) -> None:
+        """Deliver the copies that are next, and all before a number; drop those whose turn is over."""
+        for number in sorted(publisher.copies):
+            if number > publisher.due and number >= before:
+                return
+            sample, size_bytes = publisher.copies.pop(number)
+            self._add_held(source.owner, -size_bytes)
+            if number >= publisher.due:
+                self._pass(publisher, number, sample)
 
     def _pass(self, publisher: _Sender[S], number: int, sample: S) -> None:
         self._skip(publisher, number)

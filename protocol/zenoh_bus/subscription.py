@@ -181,7 +181,7 @@ class ZenohSubscription:
         source = arrived.source
         with self._lock:
             if arrived.attachment == COPY:
-                self._sequence.accept_copy(source, arrived.number, arrived)
+                self._sequence.accept_copy(source, arrived.number, arrived, size_bytes=len(arrived.payload))
                 return
             gap = self._sequence.accept(
                 source,

@@ -231,7 +231,60 @@ def test_of_a_state_the_newest_alone_is_fetched() -> None:
     assert listener.sequence.missed == 0
 
 
-def test_a_copy_is_delivered_only_as_the_next_and_its_original_then_is_not() -> None:
+def test_copies_wait_for_what_is_before_them_and_for_no_originals_of_their_own() -> None:
+    """The connection stands still: what it lacks of the copies comes by it, late, and then all is there."""
+    listener = Listener()
+    copy = listener.sequence.accept_copy
+    listener.accept(A, 0)
+    for number in (1, 3, 4, 6):
+        copy(A, number, ("a", number))
+    assert listener.numbers() == [0, 1]
+    assert listener.accept(A, 1) is None
+    assert listener.accept(A, 2) is None
+    assert listener.numbers() == [0, 1, 2, 3, 4]
+    copy(A, 5, ("a", 5))
+    assert listener.numbers() == [0, 1, 2, 3, 4, 5, 6]
+    assert listener.sequence.missed == 0
+
+
+def test_copies_fill_a_gap_that_nobody_else_can_fill() -> None:
+    listener = Listener()
+    listener.accept(A, 0)
+    gap = listener.accept(A, 4)
+    for number in (2, 3, 5):
+        listener.sequence.accept_copy(A, number, ("a", number))
+    assert listener.numbers() == [0]
+    assert listener.close(gap, []) is None
+    assert listener.numbers() == [0, 2, 3, 4, 5]
+    assert listener.sequence.missed == 1
+
+
+def test_who_fetches_nothing_gets_the_copies_of_what_is_lost() -> None:
+    listener = Listener()
+    listener.accept(A, 0)
+    listener.sequence.accept_copy(A, 2, ("a", 2))
+    assert listener.accept(A, 4, recover=False) is None
+    assert listener.numbers() == [0, 2, 4]
+    assert listener.sequence.missed == 2
+
+
+def test_copies_that_wait_are_bounded_by_number_and_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sequence, "MAX_COPIES", 3)
+    monkeypatch.setattr(sequence, "MAX_HELD_BYTES", 100)
+    listener = Listener()
+    listener.accept(A, 0)
+    for number in range(2, 9):
+        listener.sequence.accept_copy(A, number, ("a", number), size_bytes=40)
+    assert listener.accept(A, 1) is None
+    # Two have room, and give it back.
+    assert listener.numbers() == [0, 1, 2, 3]
+    for number in range(5, 12):
+        listener.sequence.accept_copy(A, number, ("a", number), size_bytes=10)
+    assert listener.accept(A, 4) is None
+    assert listener.numbers() == [0, 1, 2, 3, 4, 5, 6, 7]
+
+
+def test_a_copy_is_delivered_only_in_its_turn_and_its_original_then_is_not() -> None:
     listener = Listener()
     copy = listener.sequence.accept_copy
     copy(A, 0, ("a", 0))
