@@ -7,6 +7,7 @@ import os
 import random
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -59,8 +60,9 @@ def measure(system: System, report: FaultRow, since_ns: int) -> None:
     try:
         matched_ns = system.observer.wait_for_match(since_ns, BACK_S)
     except TimeoutError as error:
-        lines = {name: process.lines[-3:] for name, process in system.processes.items()}
-        raise RuntimeError(f"{report.fault}: {error}; {lines}") from error
+        for name, process in system.processes.items():
+            print(name, *process.lines[-60:], sep="\n    ", file=sys.stderr, flush=True)
+        raise RuntimeError(f"{report.fault}: {error}") from error
     report.recover_s.append((matched_ns - since_ns) / S_NS)
 
 
