@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import socket
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -96,6 +97,13 @@ class TestMavlink:
         placed = [take(placing, oriented(k), estimate(k)) for k in (0, 1, 8)]
         read = self.received(mavlink, placed, ("delta",))  # type: ignore[arg-type]
         assert [m.get_type() for m in read].count("VISION_POSITION_DELTA") == 1
+
+    def test_before_the_first_day_of_gps_there_is_no_gps_input(self, mavlink: Any) -> None:
+        """A Pi without a clock of its own begins in 1970."""
+        first_s = datetime(1980, 1, 6, tzinfo=UTC).timestamp()
+        placed = [replace(placed_of(), stamp_ns=round(seconds * S_NS)) for seconds in (0.0, first_s - 1.0, first_s)]
+        weeks = [m.time_week for m in self.received(mavlink, placed, ("gps",)) if m.get_type() == "GPS_INPUT"]
+        assert weeks == [0]
 
     def test_gps_input_has_place_velocity_accuracy_and_gps_time(self, mavlink: Any) -> None:
         placed = placed_of(declination_rad=0.0)

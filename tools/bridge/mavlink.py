@@ -64,7 +64,8 @@ class MavlinkTranslation:
             said.append(self._estimate(placed))
         if "delta" in self._kinds and (delta := self._delta(placed)) is not None:
             said.append(delta)
-        if "gps" in self._kinds and earth is not None:
+        # A node whose clock was never set has no time of GPS.
+        if "gps" in self._kinds and earth is not None and placed.stamp_ns >= GPS_EPOCH_S * S_NS:
             said.append(self._gps(placed, earth))
         self._before = placed
         return [self._packed(message) for message in said]
