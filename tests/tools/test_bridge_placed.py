@@ -34,7 +34,7 @@ from tests.tools.bridged import (
     take,
 )
 from tests.tools.evaluated import INFOS, info, pose, track
-from tests.tools.watched import at, attitude
+from tests.tools.watched import at, attitude, depth
 
 
 class TestPlacing:
@@ -106,6 +106,12 @@ class TestPlacing:
         assert take(placing, *INFOS.values(), oriented(), replace(estimate(), **absurd)) is None
         assert "out of numeric range" in placing.why
         assert take(placing, oriented(6), estimate(6)) is not None
+
+    def test_an_absurd_depth_leaves_the_last_sound_one(self) -> None:
+        sound, absurd = depth("b", at(4), 12.5), depth("b", at(5), 1e308)
+        placed = take(Placing("b"), *INFOS.values(), oriented(), sound, absurd, estimate())
+        assert placed is not None
+        assert placed.depth_m == 12.5
 
     def test_poses_count_only_where_no_track_is_fresh_and_the_late_track_never(self) -> None:
         placing = Placing("b")

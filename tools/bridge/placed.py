@@ -24,7 +24,8 @@ from buddyline.tools.estimate import Estimate
 # An estimate whose position has this share of the range for its sigma is worth nothing: no track is published there.
 WORTHLESS_SHARE: Final = 0.2
 MIN_RANGE_M: Final = 0.1
-# Of a position (m) and a velocity (m/s). Numbers of MAVLink are of single precision, and an autopilot squares them.
+# Of a position and a depth (m), and a velocity (m/s). Numbers of MAVLink are of single precision, and an autopilot
+# squares them.
 MOST: Final = 1e5
 
 
@@ -124,7 +125,7 @@ class Placing:
         elif isinstance(message, Attitude):
             self._attitudes.setdefault(message.node, SampleStream(0)).add(message)
         elif isinstance(message, Depth):
-            if message.node == self.vehicle:
+            if message.node == self.vehicle and abs(message.depth_m) <= MOST:
                 self._depth_m = message.depth_m
         elif isinstance(message, NodePose):
             if (message.net, message.node) == (self._net, self.vehicle):
