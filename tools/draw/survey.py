@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 LINE_COLOUR: Final = "#1f4e79"
 ALARM_COLOUR: Final = "#c00000"
 POINT_COLOUR: Final = "#2e7d32"
+PATH_COLOUR: Final = "0.55"
 # 95 % of a two-dimensional normal distribution lies within this many standard deviations.
 ELLIPSE_SD: Final = 2.448
 WIDTH_IN: Final = 7.8
@@ -40,6 +41,9 @@ def plan(adjusted: Adjusted, title: str) -> Figure:
     for leg, names in adjusted.survey.stations_legs:
         ends_m = zip(*(stations[name][:2] for name in names), strict=True)
         axis.plot(*ends_m, color=ALARM_COLOUR if leg.alarms else LINE_COLOUR, linewidth=1.2)
+    for path in adjusted.paths:
+        for part_m in path.parts:
+            axis.plot(*part_m[:, :2].T, color=PATH_COLOUR, linewidth=0.6)
     for colour, positions in spots:
         for position in positions:
             at = float(position.position_m[0]), float(position.position_m[1])

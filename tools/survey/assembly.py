@@ -27,6 +27,9 @@ SCALE_FREE: Final = 0.02
 # of hard iron). The rest is new in each leg.
 ZERO_SHARE: Final = 0.1
 IRON_SHARE: Final = 0.4
+# Of the rest, where legs follow each other within seconds: the share of the variance that lasts, and for how long.
+SLOW_SHARE: Final = 0.4
+SLOW_S: Final = 60.0
 # Time in which a gauge's zero may change by its slow error (MS5837-30BA data sheet: long-term stability; measured
 # zeros of a rig that warms up change within the first hour).
 DRIFT_S: Final = 3600.0
@@ -330,6 +333,19 @@ class _Compasses:
         self._sigma = {key: median(values) for key, values in sigmas.items()}
         # By dive and node: zero, iron ahead and iron abeam.
         self._columns: dict[tuple[int, str], tuple[int, int, int]] = {}
+        # By compass: when it was read last, and the column of its slow error then.
+        self._slow: dict[tuple[int, str], tuple[int, int]] = {}
+
+    def _slow_term(self, leg: Leg, node: str) -> tuple[int, float]:
+        """Return the term of a compass's slow error in a leg, which is partly that of the leg before."""
+        of, key, sigma = self._of, (leg.dive, node), math.sqrt(SLOW_SHARE) * self._sigma[leg.dive, node]
+        before_ns, before = self._slow.get(key, (leg.start_ns, -1))
+        kept = 0.0 if before < 0 else math.exp(-abs(leg.start_ns - before_ns) / S_NS / SLOW_S)
+        column = of.unknown(f"{WANDER} {leg.start_ns} {compass_name(leg.dive, node)}")
+        terms = [(column, 1.0)] if before < 0 else [(column, 1.0), (before, -kept)]
+        of.add("angle", -1, -1, 0.0, sigma * math.sqrt(1 - kept**2), terms, what=f"compass of {node}")
+        self._slow[key] = leg.start_ns, column
+        return column, 1.0
 
     def _terms(self, leg: Leg, node: str, heading: float) -> list[tuple[int, float]]:
         common = math.radians(self._project.settings.compass_common_deg)
@@ -361,7 +377,8 @@ class _Compasses:
     def add(self, to: Assembly, number: int, start: int, end: int, *, turned: bool) -> None:
         """Add a leg's azimuths. turned: others hang on this one by gyroscopes, so that a disturbed compass shows."""
         leg, of, turn_rad = to.legs[number], self._of, to.turns_rad[number]
-        own = math.sqrt(1 - ZERO_SHARE - IRON_SHARE)
+        quick = bool(self._project.settings.pause_s)
+        own = math.sqrt(1 - ZERO_SHARE - IRON_SHARE - (SLOW_SHARE if quick else 0.0))
         column = self.carry(to, number, start, end) if turned else None
         bearing = bearing_of(leg, self._project)
         if bearing is None:
@@ -379,6 +396,8 @@ class _Compasses:
             if angle is None:
                 continue
             terms = self._terms(leg, node, angle)
+            if quick:
+                terms.append(self._slow_term(leg, node))
             value, words = wrap(angle - against + turn_rad), f"compass of {node}"
             if column is None:
                 row = of.add("azimuth", start, end, value, sigma, terms, leg=number, what=words)

@@ -30,6 +30,7 @@ FORMATS: Final = {
     "csv": ".csv",
     "stations": ".stations.csv",
     "residuals": ".residuals.csv",
+    "paths": ".paths.csv",
     "geojson": ".geojson",
     "kml": ".kml",
     "dxf": ".dxf",
@@ -43,7 +44,7 @@ FORMATS: Final = {
 
 SAYS: Final = (
     "svx, svx-cartesian: Survex, by measurements or by coordinates; th: Therion; dat: Compass; csv: the legs; "
-    "stations, residuals: tables; geojson, kml, gpkg, dxf: maps; control, scalebars: tables for photogrammetry; "
+    "stations, residuals, paths: tables; geojson, kml, gpkg, dxf: maps; control, scalebars: tables for photogrammetry; "
     "svg, profile: plan and side view; pdf: both to print; default: svx"
 )
 
@@ -189,6 +190,7 @@ def _legs(args: argparse.Namespace) -> int:
             "station": stations,
             "leg": derived.legs,
             "turn": derived.turns,
+            "swim": derived.swims,
             "point": derived.points,
         },
     )
@@ -308,6 +310,7 @@ def exported(sheet: Sheet, kind: str, style: str = "auto") -> str | bytes:
         "csv": lambda: tables.legs_csv(sheet),
         "stations": lambda: tables.stations_csv(sheet),
         "residuals": lambda: tables.residuals_csv(sheet),
+        "paths": lambda: tables.paths_csv(sheet),
         "geojson": lambda: tables.geojson(sheet),
         "kml": lambda: maps.kml(sheet),
         "dxf": lambda: maps.dxf(sheet),

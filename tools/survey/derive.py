@@ -18,12 +18,13 @@ from buddyline.tools.survey.averages import Mean
 from buddyline.tools.survey.chain import Stop, find_standings
 from buddyline.tools.survey.gauges import StationDepth
 from buddyline.tools.survey.magnetism import iron_rad, usual_field
-from buddyline.tools.survey.project import STATION_NAME, Leg, Problem, Station, Turn
+from buddyline.tools.survey.project import STATION_NAME, Leg, Problem, Station, Swim, Turn
 from buddyline.tools.survey.readings import PairReadings
-from buddyline.tools.survey.rests import Rest, rests
+from buddyline.tools.survey.rests import Rest, pauses, rests
 from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
 from buddyline.tools.survey.shots import Shot, shoot
 from buddyline.tools.survey.sights import sights
+from buddyline.tools.survey.swims import swims_of
 from buddyline.tools.survey.turns import turns_of
 from msgspec import UNSET
 from msgspec.structs import replace
@@ -45,6 +46,7 @@ class Derived:
         self.legs: list[Leg] = []
         self.points: list[Leg] = []
         self.turns: list[Turn] = []
+        self.swims: list[Swim] = []
         self.problems: list[Problem] = []
         self.notes: dict[str, list[str]] = defaultdict(list)
         self.numbered: dict[str, int] = {}
@@ -70,6 +72,7 @@ class Derived:
             chain = _Chain(self, readings, marks, corrected, settings, limits, dive)
             self.legs += chain.legs
             self.turns += chain.turns
+            self.swims += chain.swims
             chains.append(chain)
         nodes = {node for chain in chains for node in chain.readings.nodes}
         placed = {id(mark) for chain in chains for mark in chain.placed}
@@ -134,6 +137,10 @@ class Derived:
 
         self.legs = [replace(leg, from_=renamed(leg.from_), to=renamed(leg.to)) for leg in self.legs]
         self.points = [replace(leg, from_=renamed(leg.from_)) for leg in self.points]
+        self.swims = [
+            replace(one, station=renamed(one.station), from_=renamed(one.from_), to=renamed(one.to))
+            for one in self.swims
+        ]
         for other in others:
             self.notes[first] += [note for note in self.notes.pop(other, []) if note not in self.notes[first]]
 
@@ -166,11 +173,17 @@ class _Chain:
         limits: AlarmSettings,
         dive: int,
     ) -> None:
+        if settings.pause_s:
+            if readings.track is None:
+                raise BuddylineError(f"settings.pause_s: dive {dive} has no track; solve it with one (buddyline solve)")
+            readings = readings.track
         self.readings, self.marks, self.settings, self.limits, self.dive = readings, marks, settings, limits, dive
         self.seen = sights(readings, settings)
         self.placed: list[Mark] = []
-        every = rests(readings, self.seen, settings)
+        every = (pauses if settings.pause_s else rests)(readings, self.seen, settings)
         least = f"{settings.rest_s:g} s with {settings.rest_fixes} fixes"
+        if settings.pause_s:
+            least = f"{settings.pause_s:g} s by the track"
         for rest in every:
             if rest.too_short:
                 out.add_problem(f"NO LEG: rest at {time_text(rest.start_ns)}: {rest.too_short}; a leg takes {least}")
@@ -200,6 +213,9 @@ class _Chain:
             legs.append(replace(leg, alarms=[*leg.alarms, *doubts]))
         used = [np.isin(self.seen.triggers, shot.used) for shot in shots]
         self.turns = turns_of(readings, used, dive, settings)
+        self.swims = swims_of(
+            self.readings, used, [one.station for one in self.standings], self.turns, self.dive, self.settings
+        )
         self.legs = alarms.disturbed_alike(legs, [alarms.off_fields(shot, self.usual, limits) for shot in shots])
 
     def _named(self, out: Derived, corrected: set[int]) -> list[dict[str, str]]:
@@ -251,7 +267,8 @@ class _Chain:
     def passed(self, mark: Mark) -> Leg | str:
         """Return the leg from the other node's station to a place that was swum past, or why there is none."""
         other = next(node for node in self.readings.nodes if node != mark.node)
-        station, track = self._standing_at(mark.stamp_ns, other), self.readings.track
+        station = self._standing_at(mark.stamp_ns, other)
+        track = self.readings if self.settings.pause_s else self.readings.track
         if station is None or station == mark.name:
             return f"where node {other} stood is not known"
         if track is None or (off_ns := np.abs(track.stamps_ns - mark.stamp_ns)).min() > TRACK_NEAR_NS:

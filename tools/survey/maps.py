@@ -6,6 +6,7 @@ import sqlite3
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import closing
+from itertools import pairwise
 from typing import Final, TypeAlias
 from xml.etree import ElementTree
 
@@ -18,7 +19,7 @@ from buddyline.tools.survey.placing import step_m_of
 from buddyline.tools.survey.sheet import Sheet
 from buddyline.tools.survey.tables import map_features
 
-# Name, kind, and places (n, 3): one of a station or point, two of a leg or splay.
+# Name, kind, and places (n, 3): one of a station or point, more of a leg, splay or path.
 Feature: TypeAlias = tuple[str, str, Floats]
 
 # "GPKG", and the version of the standard that is kept, 1.3.
@@ -28,18 +29,20 @@ WGS_84: Final = 4326
 # Well-known binary's types of a point and of a line with heights.
 POINT_Z, LINE_Z = 1001, 1002
 # The layers of a drawing and their colours, by AutoCAD's numbers.
-LAYERS: Final = {"station": 7, "point": 3, "leg": 5, "splay": 8}
+LAYERS: Final = {"station": 7, "point": 3, "leg": 5, "splay": 8, "path": 4}
 TEXT_M: Final = 0.2
 
 
 def features_of(sheet: Sheet) -> Iterator[Feature]:
-    """Yield stations, points, legs and splays in the grid, metres."""
+    """Yield stations, points, legs, paths and splays in the grid, metres."""
     adjusted = sheet.adjusted
     for kind, found in (("station", list(adjusted.positions.values())), ("point", adjusted.points)):
         for position in found:
             yield position.name, kind, position.position_m[None]
     for leg, names in adjusted.survey.stations_legs:
         yield leg.name, "leg", np.array([adjusted.positions[name].position_m for name in names])
+    for path in adjusted.paths:
+        yield from ((path.swim.name, "path", part_m) for part_m in path.parts)
     same_as = same_place(sheet.project, sheet.olds)
     for shot in (shot for old in sheet.olds for shot in old.shots if shot.start and not shot.end):
         start = adjusted.positions.get(same_as(shot.start))
@@ -82,11 +85,10 @@ def dxf(sheet: Sheet) -> str:
     codes += [code for layer in layers for code in layer]
     codes += [(0, "ENDTAB"), (0, "ENDSEC"), (0, "SECTION"), (2, "ENTITIES")]
     for name, kind, places_m in features_of(sheet):
-        first, last = places_m[0].tolist(), places_m[-1].tolist()
-        layer = (8, kind.upper())
-        if len(places_m) == 2:
-            codes += [(0, "LINE"), layer, *_xyz(10, first), *_xyz(11, last)]
-        else:
+        layer, first = (8, kind.upper()), places_m[0].tolist()
+        for start, end in pairwise(places_m.tolist()):
+            codes += [(0, "LINE"), layer, *_xyz(10, start), *_xyz(11, end)]
+        if len(places_m) == 1:
             codes += [(0, "POINT"), layer, *_xyz(10, first)]
             # Release 12 has no other letters than these.
             said = name.encode("ascii", "replace").decode()
@@ -120,7 +122,7 @@ def geopackage(sheet: Sheet) -> bytes:
         ]
         base.executemany("INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, NULL)", listed)
         for table, shape, count in (("stations", "POINT", 1), ("lines", "LINESTRING", 2)):
-            own = [one for one in features if len(one[2]) == count]
+            own = [one for one in features if (len(one[2]) == 1) is (count == 1)]
             every = _all(own)[:, :2]
             bounds = [*every.min(axis=0).tolist(), *every.max(axis=0).tolist()]
             base.execute(f"CREATE TABLE {table} (id INTEGER PRIMARY KEY, geom {shape}, name TEXT, kind TEXT)")

@@ -182,6 +182,28 @@ class Turn(Config, frozen=True, kw_only=True):
     sigma_deg: Positive
 
 
+class Swim(Config, frozen=True, kw_only=True, gc=False):
+    """[[swim]]: the way of `node` from one rest to the next, seen from `station`, at which the other node stood.
+
+    rows: seconds since start_ns; ahead, right, down, m, in level axes of any azimuth; 1 sd along the sight, and across
+    it. The first is at `from`, the last at `to`. sigma_deg: 1 sd of the standing node's gyroscope over all of it.
+    """
+
+    node: str
+    station: str
+    from_: str = field(name="from")
+    to: str
+    dive: int = 1
+    start_ns: int
+    sigma_deg: NonNegative
+    rows: list[tuple[float, float, float, float, float, float]]
+
+    @property
+    def name(self) -> str:
+        """Its name on maps: node, and `from-to`."""
+        return f"{self.node} {self.from_}-{self.to}"
+
+
 class Leg(Config, frozen=True, kw_only=True, gc=False):
     """[[leg]] and [[point]]: one shot from a station to a station or point, as read; angles magnetic, in degrees.
 
@@ -281,6 +303,7 @@ class Project(Config, frozen=True, kw_only=True):
     leg: list[Leg] = field(default_factory=list)
     point: list[Leg] = field(default_factory=list)
     turn: list[Turn] = field(default_factory=list)
+    swim: list[Swim] = field(default_factory=list)
     station: list[Station] = field(default_factory=list)
     problem: list[Problem] = field(default_factory=list)
 

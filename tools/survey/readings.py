@@ -97,7 +97,8 @@ class NodeReadings:
 class PairReadings:
     """One dive of a pair a, b. t_a_b_m: (n, 3), q_a_b: (n, 4), covariance: (n, 6, 6), in the order of time.
 
-    marks: of all nodes of the dive. track: the same of the track's rows, where the log has one; their triggers are 0.
+    marks: of all nodes of the dive. track: the same of the track's rows, where the log has one; their triggers are
+    numbers, and speed_mps (n,) says how fast b moves against a.
     """
 
     pair: tuple[NodeReadings, NodeReadings]
@@ -109,6 +110,7 @@ class PairReadings:
     rejected: list[Rejected]
     marks: list[Mark]
     track: PairReadings | None = None
+    speed_mps: Floats | None = None
 
     @property
     def nodes(self) -> tuple[str, str]:
@@ -162,7 +164,11 @@ def of_messages(messages: Iterable[Message], name: str = "dive") -> list[PairRea
         nodes = sensors(a), sensors(b)
         triggers = np.array([fix.trigger for fix in fixes], dtype=np.int64)
         rejected = [outcome for outcome in in_time if isinstance(outcome, Rejected)]
-        track = PairReadings(nodes, *_columns(rows), np.zeros(len(rows), np.int64), [], []) if rows else None
+        track = None
+        if rows:
+            speed_mps = np.linalg.norm([row.v_a_b_mps for row in rows], axis=1)
+            numbers = np.arange(len(rows), dtype=np.int64)
+            track = PairReadings(nodes, *_columns(rows), numbers, [], in_order, speed_mps=speed_mps)
         found.append(PairReadings(nodes, *_columns(fixes), triggers, rejected, in_order, track))
     if not found:
         raise BuddylineError(f"{name}: holds no poses; solve the dive first (buddyline solve)")

@@ -77,6 +77,31 @@ def rests(readings: PairReadings, seen: Sights, settings: SurveySettings) -> lis
     return sorted([*found, *lost], key=lambda one: one.start_ns)
 
 
+def pauses(track: PairReadings, seen: Sights, settings: SurveySettings) -> list[Rest]:
+    """Return the pauses of a dive, of its track's rows: of each stretch at rest the pause_s in which it moved least.
+
+    At both ends of a stretch a node comes slowly to its station, or leaves it.
+    """
+    assert track.speed_mps is not None
+    handled_by = [handled(node, seen.stamps_ns, settings) for node in track.pair]
+    still = (track.speed_mps < settings.rest_speed_mps) & ~np.any(handled_by, axis=0)
+    found = []
+    for run in _merged(_runs(seen, still), seen):
+        stamps_ns = seen.stamps_ns[run]
+        ends = np.searchsorted(stamps_ns, stamps_ns + round(settings.pause_s * S_NS))
+        fits = np.flatnonzero(ends < len(run))
+        if not len(fits):
+            continue
+        line_m = seen.line_m[run]
+        moved_m = [float(np.ptp(line_m[i : ends[i] + 1], axis=0).sum()) for i in fits]
+        first = int(fits[int(np.argmin(moved_m))])
+        part = run[first : int(ends[first]) + 1]
+        chosen = np.zeros(len(seen.stamps_ns), dtype=bool)
+        chosen[part] = True
+        found.append(Rest(chosen, int(stamps_ns[first]), int(stamps_ns[ends[first]]), _line_m(seen, part)))
+    return found
+
+
 def _long_enough(count: int, span_ns: int, settings: SurveySettings, share: float = 1.0) -> bool:
     return count >= share * settings.rest_fixes and span_ns >= share * settings.rest_s * S_NS
 

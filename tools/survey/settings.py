@@ -14,7 +14,8 @@ class SurveySettings(Config, frozen=True, kw_only=True):
 
     procedure: which node moves if neither marks nor depths show it: the nodes pass one another in turn
     (leapfrog), or node `first` stays. first: the node at the first station (default: the pair's first).
-    rest_s, rest_fixes: the minimum for a leg. rest_speed_mps: below it the pair counts as resting.
+    rest_s, rest_fixes: the minimum for a leg. rest_speed_mps: below it the pair counts as resting. pause_s: where it is
+    not 0, a leg is made of each pause so long, by the track and not by poses.
     turn_radps, jolt_mps2: gyroscope and accelerometer above which a node is handled, not held.
     centering_m: 1 sd, how well a node is held at its station, each axis. passing_m: how near to a station a node that
     swims past it is, as it is marked. range_share: 1 sd, error of the ranges'
@@ -31,6 +32,7 @@ class SurveySettings(Config, frozen=True, kw_only=True):
     rest_s: Positive = 4.0
     rest_fixes: Annotated[int, Meta(ge=3)] = 8
     rest_speed_mps: Positive = 0.1
+    pause_s: NonNegative = 0.0
     turn_radps: Positive = 0.6
     jolt_mps2: Positive = 1.5
     centering_m: NonNegative = 0.01

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Collection, Iterable
-from datetime import date
+from datetime import UTC, date, datetime
 from typing import Any, Final
 
+import numpy as np
+from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.measure.tables import csv_lines
 from buddyline.tools.survey.connected import station_depths
@@ -30,6 +32,11 @@ STATION_DIGITS: Final = {
 }
 # The columns that go on a map.
 MAP_PROPERTIES: Final = ("name", "kind", "ellipse_major_m", "ellipse_minor_m", "ellipse_azimuth_deg", "sigma_up_m")
+
+PATH_COLUMNS: Final = (
+    *("dive", "node", "from", "to", "seen_from", "time"),
+    *("east_m", "north_m", "up_m", "sigma_east_m", "sigma_north_m", "sigma_up_m"),
+)
 
 FOOT_M: Final = 0.3048
 MISSING: Final = "-999.00"
@@ -121,6 +128,19 @@ def stations_csv(sheet: Sheet) -> str:
     )
 
 
+def paths_csv(sheet: Sheet) -> str:
+    """Return the ways that were swum, place by place: metres, 1 sd of each axis, and the time in UTC."""
+    rows = []
+    for path in sheet.adjusted.paths:
+        swim = path.swim
+        sigmas_m = np.sqrt(path.covariance[:, range(3), range(3)])
+        for seconds, place_m, sigma_m in zip(path.seconds.tolist(), path.position_m, sigmas_m, strict=True):
+            when = datetime.fromtimestamp(swim.start_ns / S_NS + seconds, UTC).isoformat(timespec="milliseconds")
+            known = [f"{value:z.3f}" for value in (*place_m, *sigma_m)]
+            rows.append([swim.dive, swim.node, swim.from_, swim.to, swim.station, when, *known])
+    return "".join(csv_lines(PATH_COLUMNS, rows))
+
+
 def map_features(sheet: Sheet) -> list[dict[str, Any]]:
     """Return stations, points and legs as features of GeoJSON: WGS 84, longitude first, altitude third."""
     if not sheet.north_known:
@@ -145,6 +165,12 @@ def map_features(sheet: Sheet) -> list[dict[str, Any]]:
     for leg, names in sheet.adjusted.survey.stations_legs:
         properties = {"name": leg.name, "kind": "leg", "distance_m": leg.distance_m, "grade": leg.grade}
         add("LineString", [at[name] for name in names], properties | {"alarms": leg.alarms})
+    for path in sheet.adjusted.paths:
+        for part_m in path.parts:
+            degrees = [sheet.adjusted.grid.degrees(place_m) or (0.0, 0.0) for place_m in part_m]
+            heights_m = part_m[:, 2].tolist()
+            line = [[round(e, 8), round(n, 8), round(z, 3)] for (n, e), z in zip(degrees, heights_m, strict=True)]
+            add("LineString", line, {"name": path.swim.name, "kind": "path"})
     return features
 
 

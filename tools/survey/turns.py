@@ -1,9 +1,10 @@
-"""How far a node's sight turns from one rest to the next, by its gyroscope: azimuths that need no compass."""
+"""How a node turns from one rest to the next, by its gyroscope: azimuths that need no compass."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
@@ -22,15 +23,9 @@ LEAST_SIGHTS: Final = 3
 
 def turns_of(readings: PairReadings, chosen: Sequence[Bools], dive: int, settings: SurveySettings) -> list[Turn]:
     """Return both nodes' turns between rests that follow each other; chosen: the fixes (n,) of each rest."""
-    references = [np.array(settings.reference_m.get(node, (0.0, 0.0, 0.0))) for node in readings.nodes]
-    between_m = readings.t_a_b_m + rotate(readings.q_a_b, references[1]) - references[0]
-    # Each node's line to the other one, in its own camera frame.
-    sights_m = between_m, -rotate(conjugate(readings.q_a_b), between_m)
     found = []
-    for node, line_m in zip(readings.pair, sights_m, strict=True):
-        q_body_camera = normalized(np.array(node.info.q_body_camera_xyzw))
-        line_body_m = rotate(np.broadcast_to(q_body_camera, (len(line_m), 4)), line_m)
-        zero = _zero(node, readings.stamps_ns, chosen)
+    for node, line_body_m in zip(readings.pair, body_sights(readings, settings), strict=True):
+        zero = zero_of(node, readings.stamps_ns, chosen)
         turns = []
         for before, after in pairwise(chosen):
             turn = _turn(node, zero, readings.stamps_ns, line_body_m, np.flatnonzero(before), np.flatnonzero(after))
@@ -54,7 +49,17 @@ def turns_of(readings: PairReadings, chosen: Sequence[Bools], dive: int, setting
     return found
 
 
-def _zero(node: NodeReadings, stamps_ns: Ints, chosen: Sequence[Bools]) -> Floats:
+def body_sights(readings: PairReadings, settings: SurveySettings) -> tuple[Floats, Floats]:
+    """Return each node's line to the other one, (n, 3), from reference point to reference point in its body's axes."""
+    references = [np.array(settings.reference_m.get(node, (0.0, 0.0, 0.0))) for node in readings.nodes]
+    between_m = readings.t_a_b_m + rotate(readings.q_a_b, references[1]) - references[0]
+    lines_m = between_m, -rotate(conjugate(readings.q_a_b), between_m)
+    turns = [normalized(np.array(node.info.q_body_camera_xyzw)) for node in readings.pair]
+    a, b = (rotate(np.broadcast_to(q, (len(one), 4)), one) for q, one in zip(turns, lines_m, strict=True))
+    return a, b
+
+
+def zero_of(node: NodeReadings, stamps_ns: Ints, chosen: Sequence[Bools]) -> Floats:
     """Return what a gyroscope reads at rest, (3,), rad/s: the median over all rests of its mean."""
     rates = []
     for one in chosen:
@@ -71,26 +76,17 @@ def _turn(
     The last is the random walk, rad^2/s, that the sights show during the rests: a walk over T has a variance of its
     rate times T / 6, beside the white noise that neighbours differ by.
     """
-    imu = node.imu
-    part = imu.between(int(stamps_ns[before[0]]), int(stamps_ns[after[-1]]))
-    at_ns, rate, accel = imu.stamps_ns[part], imu["gyro_radps"][part], imu["accel_mps2"][part]
-    steps_s = np.diff(at_ns) / S_NS
-    if len(at_ns) < LEAST_SIGHTS or np.isnan(rate).any() or steps_s.max() > GAP_SHARE * float(np.median(steps_s)):
+    carried = carry(node, zero, stamps_ns[before], stamps_ns[after])
+    if carried is None:
         return None
-    q = _carried((rate[1:] - zero) * steps_s[:, None])
-    azimuths, ahead = [], []
+    azimuths = []
     for sights in (before, after):
-        index = np.clip(np.searchsorted(at_ns, stamps_ns[sights]), 0, len(at_ns) - 1)
-        first, last = int(index[0]), int(index[-1]) + 1
-        # At rest the specific force points up: what the gyroscope has tilted since is taken off.
-        up = rotate(q[first:last], accel[first:last]).mean(axis=0)
-        level = _levelling(up)
-        seen_m = rotate(np.broadcast_to(level, (len(sights), 4)), rotate(q[index], line_m[sights]))
+        seen_m = carried.level(stamps_ns[sights], line_m[sights])
         azimuths.append(unwrapped(np.arctan2(seen_m[:, 1], seen_m[:, 0])))
-        ahead.append(level)
     turned = float(azimuths[1].mean() - azimuths[0].mean())
     # The way round that the node has gone.
-    heading = rotate(multiply(np.broadcast_to(ahead[0], q.shape), q), np.array([1.0, 0.0, 0.0]))
+    q = multiply(np.broadcast_to(carried.levels[0], carried.q.shape), carried.q)
+    heading = rotate(q, np.array([1.0, 0.0, 0.0]))
     swept = np.unwrap(np.arctan2(heading[:, 1], heading[:, 0]))
     turned += 2 * math.pi * round((float(swept[-1] - swept[0]) - turned) / (2 * math.pi))
     times_s = stamps_ns / S_NS
@@ -106,6 +102,49 @@ def _turn(
         if len(one) > LEAST_SIGHTS
     ]
     return turned, float(times_s[after].mean() - times_s[before].mean()), scatter, float(np.mean(walks or [0.0]))
+
+
+@dataclass(frozen=True, eq=False)
+class Carried:
+    """A node's attitude from one rest to the next, by its gyroscope: q (m, 4), body to the first body, at at_ns (m,).
+
+    levels: (2, 4), of each rest: from the first body to x ahead, z down. between_ns: end of the first rest, begin of
+    the second.
+    """
+
+    at_ns: Ints
+    q: Floats
+    levels: Floats
+    between_ns: tuple[int, int]
+
+    def level(self, stamps_ns: Ints, vectors: Floats) -> Floats:
+        """Return vectors (n, 3) of the body at stamps_ns (n,) in level axes, whose azimuth is arbitrary.
+
+        By the accelerometer in both rests: what the gyroscope tilts from one to the other grew evenly.
+        """
+        index = np.clip(np.searchsorted(self.at_ns, stamps_ns), 0, len(self.at_ns) - 1)
+        start_ns, end_ns = self.between_ns
+        share = np.clip((stamps_ns - start_ns) / max(end_ns - start_ns, 1), 0.0, 1.0)[:, None]
+        return rotate(normalized((1 - share) * self.levels[0] + share * self.levels[1]), rotate(self.q[index], vectors))
+
+
+def carry(node: NodeReadings, zero: Floats, before_ns: Ints, after_ns: Ints) -> Carried | None:
+    """Carry a node's attitude through two rests, by their fixes' stamps; None where its samples have gaps."""
+    imu = node.imu
+    part = imu.between(int(before_ns[0]), int(after_ns[-1]))
+    at_ns, rate, accel = imu.stamps_ns[part], imu["gyro_radps"][part], imu["accel_mps2"][part]
+    steps_s = np.diff(at_ns) / S_NS
+    if len(at_ns) < LEAST_SIGHTS or np.isnan(rate).any() or steps_s.max() > GAP_SHARE * float(np.median(steps_s)):
+        return None
+    q = _carried((rate[1:] - zero) * steps_s[:, None])
+    levels = []
+    for stamps_ns in (before_ns, after_ns):
+        first, last = np.clip(np.searchsorted(at_ns, stamps_ns[[0, -1]]), 0, len(at_ns) - 1).tolist()
+        # At rest the specific force points up: what the gyroscope has tilted since is taken off.
+        levels.append(_levelling(rotate(q[first : last + 1], accel[first : last + 1]).mean(axis=0)))
+    if levels[0] @ levels[1] < 0:
+        levels[1] = -levels[1]
+    return Carried(at_ns, q, np.array(levels), (int(before_ns[-1]), int(after_ns[0])))
 
 
 def _levelling(up: Floats) -> Floats:
