@@ -14,6 +14,10 @@ DENSE: Final = 1500
 SYMMETRIC: Final[dict[str, Any]] = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
 # A block in more rows than this many times the root of the number of blocks is eliminated last (the rule of AMD).
 OFTEN: Final = 10.0
+# A single unknown in more rows than this is an instrument's. A leg's own (azimuth, a gyroscope's wander) is in fewer.
+OWN_ROWS: Final = 8
+# Loops times instruments' unknowns, from which on dives cross so often that only one order is looked for.
+CROSSED: Final = 5_000_000
 # Subtrees of up to this many unknowns are one front.
 WIDE: Final = 48
 
@@ -185,23 +189,17 @@ class Tree:
     """
 
     def __init__(self, rows: Ints, columns: Ints, blocks: Ints) -> None:
-        beside, rank = _least_fill(rows, blocks[columns])
-        count, turn = len(rank), np.argsort(rank)
-        widths = np.bincount(blocks)[turn].tolist()
+        of_block = np.bincount(blocks)
+        beside, ranks = _orders(rows, blocks[columns], of_block)
         # By rank, from here on.
-        starts, ends = beside.indptr.tolist(), rank[beside.indices].tolist()
-        under: list[set[int]] = []
-        children: list[list[int]] = [[] for _ in range(count)]
+        found = [(*_eliminated(beside, rank, of_block), rank) for rank in ranks]
+        _, under, children, rank = min(found, key=lambda one: one[0])
+        count, widths = len(rank), of_block[np.argsort(rank)].tolist()
         sizes, parents = list(widths), [-1] * count
-        for k, block in enumerate(turn.tolist()):
-            here = {other for other in ends[starts[block] : starts[block + 1]] if other > k}
-            here.update(*(under[child] for child in children[k]))
-            here.discard(k)
-            under.append(here)
-            if here:
-                parents[k] = parent = min(here)
-                children[parent].append(k)
-                sizes[parent] += sizes[k]
+        for parent, own in enumerate(children):
+            for child in own:
+                parents[child] = parent
+                sizes[parent] += sizes[child]
         post: list[int] = []
         stack = [k for k in range(count) if parents[k] < 0]
         while stack:
@@ -230,10 +228,33 @@ class Tree:
             self.below.append(np.repeat(first[parts] - np.cumsum(many) + many, many) + np.arange(many.sum()))
 
 
-def _least_fill(rows: Ints, blocks: Ints) -> tuple[Any, Ints]:
-    """Return which blocks meet in a row, (b, b), and the rank of each in an order of little fill (b,).
+def _eliminated(beside: Any, rank: Ints, widths: Ints) -> tuple[float, list[set[int]], list[list[int]]]:
+    """Return the operations that an order of blocks takes, and by rank what is below each block in L, and its children.
 
-    The order is Liu's minimum degree; blocks in very many rows are last.
+    beside: (b, b), which blocks meet in a row; widths: (b,), each one's unknowns.
+    """
+    turn = np.argsort(rank)
+    wide, starts, ends = widths[turn].tolist(), beside.indptr.tolist(), rank[beside.indices].tolist()
+    under: list[set[int]] = []
+    children: list[list[int]] = [[] for _ in turn]
+    work = 0.0
+    for k, block in enumerate(turn.tolist()):
+        here = {other for other in ends[starts[block] : starts[block + 1]] if other > k}
+        here.update(*(under[child] for child in children[k]))
+        here.discard(k)
+        under.append(here)
+        if here:
+            children[min(here)].append(k)
+        work += wide[k] * float(wide[k] + sum(wide[other] for other in here)) ** 2
+    return work, under, children
+
+
+def _orders(rows: Ints, blocks: Ints, widths: Ints) -> tuple[Any, list[Ints]]:
+    """Return which blocks meet in a row, (b, b), and orders of little fill: the rank of each block, (b,).
+
+    Both are Liu's minimum degree, with some blocks last: those of instruments; or those in very many rows alone. The
+    first is better where dives cross often, the second where they hardly do; where they cross very often it is not
+    looked for, because the search itself takes long.
     """
     from scipy.sparse import csc_array
     from scipy.sparse.linalg import splu
@@ -241,12 +262,18 @@ def _least_fill(rows: Ints, blocks: Ints) -> tuple[Any, Ints]:
     met = csc_array((np.ones(len(rows)), (blocks, rows)), shape=(blocks.max() + 1, rows.max() + 1))
     met.data[:] = 1.0
     beside = (met @ met.T).tocsc()
-    often = np.bincount(met.indices) > OFTEN * math.sqrt(beside.shape[0])
-    seldom = np.flatnonzero(~often)
-    rank = np.empty(len(often), dtype=np.int64)
-    if len(seldom):
-        between = beside[seldom][:, seldom].tocsc()
-        between.setdiag(between.sum(axis=0) + 1)
-        rank[seldom] = splu(between, permc_spec="MMD_AT_PLUS_A", **SYMMETRIC).perm_c
-    rank[often] = np.arange(len(seldom), len(often))
-    return beside, rank
+    in_rows = np.bincount(met.indices)
+    shared = (widths == 1) & (in_rows > OWN_ROWS)
+    often = in_rows > OFTEN * math.sqrt(beside.shape[0])
+    places = beside[~shared][:, ~shared]
+    loops = (places.nnz - places.shape[0]) // 2 - places.shape[0] + 1
+    ranks = []
+    for last in (shared, often) if loops * int(shared.sum()) < CROSSED else (shared | often,):
+        first, rank = np.flatnonzero(~last), np.empty(len(last), dtype=np.int64)
+        if len(first):
+            between = beside[first][:, first].tocsc()
+            between.setdiag(between.sum(axis=0) + 1)
+            rank[first] = splu(between, permc_spec="MMD_AT_PLUS_A", **SYMMETRIC).perm_c
+        rank[last] = np.arange(len(first), len(last))
+        ranks.append(rank)
+    return beside, ranks
