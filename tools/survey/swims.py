@@ -64,7 +64,7 @@ def swims_of(
         return []
     sigmas_deg = {(one.node, one.from_ns): one.sigma_deg for one in turns}
     spans_ns = [(int(at[0]), int(at[-1])) for at in (readings.stamps_ns[one] for one in chosen)]
-    zeros = [zero_of(node, readings.stamps_ns, chosen) for node in track.pair]
+    zeros = [zero_of(node, readings.stamps_ns, chosen, settings) for node in track.pair]
     sights_m, stamps_ns = body_sights(track, settings), track.stamps_ns
     along_m, across_m = _spreads(track)
     found = []

@@ -19,13 +19,16 @@ from buddyline.tools.survey.settings import SurveySettings
 # A gap between samples this many times the usual one may hide a turn.
 GAP_SHARE: Final = 5.0
 LEAST_SIGHTS: Final = 3
+# Spans over which a gyroscope is held against attitude messages; those that differ by more than 29 degrees are left out.
+SPAN_NS: Final = 5 * S_NS
+NEAR_COSINE: Final = math.cos(math.radians(14.5))
 
 
 def turns_of(readings: PairReadings, chosen: Sequence[Bools], dive: int, settings: SurveySettings) -> list[Turn]:
     """Return both nodes' turns between rests that follow each other; chosen: the fixes (n,) of each rest."""
     found = []
     for node, line_body_m in zip(readings.pair, body_sights(readings, settings), strict=True):
-        zero = zero_of(node, readings.stamps_ns, chosen)
+        zero = zero_of(node, readings.stamps_ns, chosen, settings)
         turns = []
         for before, after in pairwise(chosen):
             turn = _turn(node, zero, readings.stamps_ns, line_body_m, np.flatnonzero(before), np.flatnonzero(after))
@@ -59,13 +62,41 @@ def body_sights(readings: PairReadings, settings: SurveySettings) -> tuple[Float
     return a, b
 
 
-def zero_of(node: NodeReadings, stamps_ns: Ints, chosen: Sequence[Bools]) -> Floats:
-    """Return what a gyroscope reads at rest, (3,), rad/s: the median over all rests of its mean."""
+def zero_of(node: NodeReadings, stamps_ns: Ints, chosen: Sequence[Bools], settings: SurveySettings) -> Floats:
+    """Return what a gyroscope reads at rest, (3,), rad/s: the median over all rests of its mean.
+
+    In short pauses a node sways: there it is what the gyroscope adds to the attitude messages' turning, all dive long.
+    """
+    if settings.pause_s:
+        return _zero_by_attitude(node)
     rates = []
     for one in chosen:
         part = node.imu.between(int(stamps_ns[one][0]), int(stamps_ns[one][-1]))
         rates.append(np.nanmean(node.imu["gyro_radps"][part], axis=0) if part.stop > part.start else np.zeros(3))
     return np.asarray(np.median(rates, axis=0)) if rates else np.zeros(3)
+
+
+def _zero_by_attitude(node: NodeReadings) -> Floats:
+    """Return a gyroscope's zero: by how much it turns more than the attitude messages, over spans of SPAN_NS.
+
+    Errors of single messages cancel, because each span begins where the one before ends.
+    """
+    imu, at_ns = node.imu, node.attitude.stamps_ns
+    steps_s = np.diff(imu.stamps_ns) / S_NS
+    rate = imu["gyro_radps"][1:]
+    if len(at_ns) < 2 or len(steps_s) < LEAST_SIGHTS or np.isnan(rate).any():
+        return np.zeros(3)
+    marks = np.unique(np.searchsorted(at_ns, np.arange(imu.stamps_ns[0], imu.stamps_ns[-1], SPAN_NS)))
+    marks = marks[marks < len(at_ns)]
+    q = _carried(rate * steps_s[:, None])
+    index = np.clip(np.searchsorted(imu.stamps_ns, at_ns[marks]), 0, len(q) - 1)
+    said, felt = node.attitude["q_ned_body_xyzw"][marks], q[index]
+    turned = [multiply(conjugate(one[:-1]), one[1:]) for one in (said, felt)]
+    more = multiply(conjugate(turned[0]), turned[1])
+    spans_s = np.diff(at_ns[marks]) / S_NS
+    near = (spans_s < 2 * SPAN_NS / S_NS) & (np.abs(more[:, 3]) > NEAR_COSINE)
+    angles = 2 * more[near, :3] * np.sign(more[near, 3:])
+    return np.asarray(angles.sum(axis=0) / spans_s[near].sum()) if near.any() else np.zeros(3)
 
 
 def _turn(
