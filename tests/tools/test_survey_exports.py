@@ -3,8 +3,10 @@
 import csv
 import io
 import json
+import math
 import shutil
 import subprocess
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -337,6 +339,22 @@ def test_drawings_and_report_hold_every_station():
     assert "misclosure" in page
     assert "ALARM: leg 3-4" in page
     assert "://" not in page
+
+
+def test_a_leg_goes_in_the_profile_as_it_is_extended():
+    course = world.line(np.random.default_rng(3), 5)
+    legs = world.readings_of(course, np.random.default_rng(2))
+    legs[1] = replace(legs[1], extend="left")
+    legs[2] = replace(legs[2], extend="normal")
+    edits = [Edit(leg="3-4", extend="vertical"), Edit(leg="4-5", extend="ignore")]
+    adjusted = adjust(world.project_of(legs, edit=edits))
+    (axis,) = profile(adjusted, "Demo").axes
+    moved_m = [float(np.diff(line.get_xdata())[0]) for line in axis.lines]
+    runs_m = [
+        math.hypot(*(adjusted.positions[b].position_m - adjusted.positions[a].position_m)[:2])
+        for a, b in pairwise("0123")
+    ]
+    assert moved_m == pytest.approx([runs_m[0], -runs_m[1], -runs_m[2], 0.0])
 
 
 def test_no_name_stands_on_another_and_the_plan_has_north_and_a_scale():

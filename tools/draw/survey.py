@@ -76,16 +76,27 @@ def _round_below(length_m: float) -> float:
 
 
 def profile(adjusted: Adjusted, title: str) -> Figure:
-    """Draw the extended elevation: the way along the legs against altitude, each leg once."""
+    """Draw the extended elevation: the way along the legs against altitude, each leg once.
+
+    A leg goes to the right, or as its `extend` says: left, vertical, normal (as the leg before it), reverse (against
+    that), a number (per cent of its run), ignore or hide (not drawn).
+    """
     along_m: dict[str, float] = {}
+    # By station, the way (1 right, -1 left) in which it was reached.
+    ways: dict[str, float] = {}
     segments = []
     names: list[tuple[str, tuple[float, float]]] = []
     reach_m = 0.0
     for line in adjusted.lines:
         start_m, end_m = (adjusted.positions[name].position_m for name in (line.leg.from_, line.leg.to))
+        extend, before = adjusted.survey.project.extend_of(line.leg), ways.get(line.leg.from_, 1.0)
+        if extend in ("ignore", "hide"):
+            continue
+        share = _share(extend, before)
         begin_m = along_m.setdefault(line.leg.from_, reach_m)
-        reached_m = begin_m + math.hypot(*(end_m - start_m)[:2].tolist())
+        reached_m = begin_m + share * math.hypot(*(end_m - start_m)[:2].tolist())
         along_m.setdefault(line.leg.to, reached_m)
+        ways.setdefault(line.leg.to, math.copysign(1.0, share) if share else before)
         reach_m = max(reach_m, reached_m)
         segments.append(((begin_m, reached_m), (float(start_m[2]), float(end_m[2])), bool(line.leg.alarms)))
         names += [] if names else [(line.leg.from_, (begin_m, float(start_m[2])))]
@@ -96,6 +107,13 @@ def profile(adjusted: Adjusted, title: str) -> Figure:
         axis.plot(along, altitude, color=ALARM_COLOUR if alarm else LINE_COLOUR, linewidth=1.2)
     _names(figure, axis, names)
     return figure
+
+
+def _share(extend: str, before: float) -> float:
+    """Return how much of its run a leg goes to the right; before: the way of the leg before it."""
+    if extend.isdecimal():
+        return before * float(extend) / 100
+    return {"left": -1.0, "vertical": 0.0, "reverse": -before, "normal": before}.get(extend, 1.0)
 
 
 def _names(figure: Figure, axis: Axes, names: Sequence[tuple[str, tuple[float, float]]]) -> None:

@@ -340,10 +340,12 @@ class _Compasses:
         """Return the term of a compass's slow error in a leg, which is partly that of the leg before."""
         of, key, sigma = self._of, (leg.dive, node), math.sqrt(SLOW_SHARE) * self._sigma[leg.dive, node]
         before_ns, before = self._slow.get(key, (leg.start_ns, -1))
+        if before >= 0 and before_ns == leg.start_ns:
+            return before, 1.0
         kept = 0.0 if before < 0 else math.exp(-abs(leg.start_ns - before_ns) / S_NS / SLOW_S)
         column = of.unknown(f"{WANDER} {leg.start_ns} {compass_name(leg.dive, node)}")
         terms = [(column, 1.0)] if before < 0 else [(column, 1.0), (before, -kept)]
-        of.add("angle", -1, -1, 0.0, sigma * math.sqrt(1 - kept**2), terms, what=f"compass of {node}")
+        of.add("angle", -1, -1, 0.0, sigma * math.sqrt(1 - kept**2), terms, what=f"{WANDER} of a compass")
         self._slow[key] = leg.start_ns, column
         return column, 1.0
 

@@ -14,6 +14,7 @@ from typing import Final
 
 import numpy as np
 from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.survey.assembly import WANDER
 from buddyline.tools.survey.connected import Change, Survey
 from buddyline.tools.survey.observations import ANGLES, CHECKED, DISTANCE, Solution
 
@@ -156,7 +157,8 @@ def _suspects(survey: Survey, solution: Solution, taken: Change) -> Iterator[_Su
     disturbed = w2[model.robust].max(initial=0.0)
     for row in np.flatnonzero(tried & (w2 > critical)).tolist():
         leg, what = int(model.leg[row]), of.what[row]
-        if (leg, what) in taken.drops or (what.startswith("gyroscope") and w2[row] < disturbed):
+        gyroscope = what.startswith("gyroscope")
+        if (leg, what) in taken.drops or what.startswith(WANDER) or (gyroscope and w2[row] < disturbed):
             continue
         off = abs(float(solution.misfit[row] / r[row]))
         if model.kind[row] == DISTANCE and leg >= 0 and survey.legs[leg].from_node:

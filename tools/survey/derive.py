@@ -293,6 +293,9 @@ class _Chain:
         bad = alarms.disturbed(shot, self.usual, self.limits)
         leg = replace(one_leg(shot, station, rear, self.usual), dive=self.dive, disturbed=bad)
         leg = replace(leg, alarms=alarms.of_leg(leg, shot, self.usual, self.limits))
+        if self.settings.pause_s:
+            # Rows of the track are no triggers.
+            leg = replace(leg, fixes_used="", unused={})
         return replace(leg, grade=alarms.grade(leg))
 
 

@@ -114,12 +114,16 @@ class HandMark(Config, frozen=True, kw_only=True):
 
 
 class Edit(Config, frozen=True, kw_only=True):
-    """[[edit]]: a person's decision on a leg, named "from-to" ("3-4"), or on the repeat that began at start_ns."""
+    """[[edit]]: a person's decision on a leg, named "from-to" ("3-4"), or on the repeat that began at start_ns.
+
+    extend: which way it goes in the extended elevation, where the survey that it was read from says otherwise, or not.
+    """
 
     leg: str
     start_ns: int | UnsetType = UNSET
     use: bool = True
     compass: Literal["both", "fore", "back"] | UnsetType = UNSET
+    extend: Literal["right", "left", "vertical", "ignore"] | UnsetType = UNSET
     note: str = ""
 
 
@@ -196,7 +200,7 @@ class Swim(Config, frozen=True, kw_only=True, gc=False):
     dive: int = 1
     start_ns: int
     sigma_deg: NonNegative
-    rows: list[tuple[float, float, float, float, float, float]]
+    rows: list[Annotated[list[float], Meta(min_length=6, max_length=6)]]
 
     @property
     def name(self) -> str:
@@ -210,7 +214,7 @@ class Leg(Config, frozen=True, kw_only=True, gc=False):
     azimuth_deg, inclination_deg: by the node at `from`, towards `to`; back_*: by the node at `to`, towards
     `from`. turn_deg: from magnetic to grid north, where it was stated, declination_deg: to true north. *_sigma_*: 1
     sd; *_noise_*: its part that is new in each leg, not the gauge's own. fixes_used, unused: triggers, as ranges;
-    unused: by reason. A leg of an old survey has no nodes.
+    unused: by reason. A leg of an old survey has no nodes. extend: as an old survey says it.
     """
 
     from_: str = field(name="from")
@@ -248,6 +252,7 @@ class Leg(Config, frozen=True, kw_only=True, gc=False):
     fixes_used: str = ""
     unused: dict[str, str] = field(default_factory=dict)
     grade: int = 0
+    extend: str = ""
     alarms: list[str] = field(default_factory=list)
     note: str = ""
 
@@ -313,6 +318,11 @@ class Project(Config, frozen=True, kw_only=True):
             return None
         found = [edit for edit in self.edit if edit.leg == leg.name and edit.start_ns in (UNSET, leg.start_ns)]
         return max(found, key=lambda edit: edit.start_ns is not UNSET, default=None)
+
+    def extend_of(self, leg: Leg) -> str:
+        """Return which way a leg goes in the extended elevation: right, left, vertical, ignore, ...; or nothing."""
+        edit = self.edit_of(leg)
+        return leg.extend if edit is None or edit.extend is UNSET else edit.extend
 
     def taken_out(self, leg: Leg) -> bool:
         """Tell whether a person's edit has taken the leg out."""

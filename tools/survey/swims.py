@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.tools.survey.averages import Bools, Floats
+from buddyline.tools.survey.normal import DENSE
 from buddyline.tools.survey.project import Project, Swim, Turn
 from buddyline.tools.survey.readings import PairReadings
 from buddyline.tools.survey.settings import SurveySettings
@@ -98,12 +99,10 @@ def swims_of(
                 start_ns=before[0],
                 sigma_deg=sigmas_deg[node, before[0]],
                 rows=[
-                    (
+                    [
                         round(float(stamps_ns[row] - before[0]) / S_NS, 2),
-                        *(round(float(value), 4) for value in place_m),
-                        round(float(along_m[row]), 4),
-                        round(float(across_m[row]), 4),
-                    )
+                        *(round(float(value), 4) for value in (*place_m, along_m[row], across_m[row])),
+                    ]
                     for row, place_m in rows
                 ],
             )
@@ -123,14 +122,17 @@ def _spreads(track: PairReadings) -> tuple[Floats, Floats]:
 def paths_of(project: Project, solution: Solution, origin_m: Floats) -> list[Path]:
     """Return the swims between adjusted stations. origin_m: (3,), to which the solution is relative."""
     at = solution.observations.at
+    known = [swim for swim in project.swim if {swim.station, swim.from_, swim.to} <= set(at)]
+    stations = np.array([[at[name] for name in (swim.station, swim.from_, swim.to)] for swim in known], dtype=np.int64)
+    unknowns = (3 * stations[..., None] + np.arange(3)).reshape(-1, 9)
+    every = np.unique(unknowns)
+    # Of few stations the inverse is made once.
+    whole = solution.normal.inverse(every) if len(every) <= DENSE else None
     found = []
-    for swim in project.swim:
-        names = swim.station, swim.from_, swim.to
-        if not all(name in at for name in names):
-            continue
-        places_m = solution.position_m[[at[name] for name in names]]
-        unknowns = np.concatenate([3 * at[name] + np.arange(3) for name in names])
-        path = _hung(swim, places_m, solution.normal.inverse(unknowns), project.settings)
+    for swim, of, columns in zip(known, stations, unknowns, strict=True):
+        place = np.searchsorted(every, columns)
+        joint = solution.normal.inverse(columns) if whole is None else whole[np.ix_(place, place)]
+        path = _hung(swim, solution.position_m[of], joint, project.settings)
         if path is not None:
             found.append(Path(swim, path.seconds, path.position_m + origin_m, path.covariance))
     return found

@@ -19,7 +19,7 @@ from buddyline.tools.survey.settings import SurveySettings
 # A gap between samples this many times the usual one may hide a turn.
 GAP_SHARE: Final = 5.0
 LEAST_SIGHTS: Final = 3
-# Spans over which a gyroscope is held against attitude messages; those that differ by more than 29 degrees are left out.
+# Spans over which a gyroscope is held against attitude messages. Those that differ by 29 degrees and more are left out.
 SPAN_NS: Final = 5 * S_NS
 NEAR_COSINE: Final = math.cos(math.radians(14.5))
 

@@ -229,6 +229,7 @@ def _leg(shot: OldShot, distance_m: float, sigma_m: float, **readings: Any) -> L
         distance_m=distance_m,
         distance_sigma_m=sigma_m,
         fixes=0,
+        extend=shot.extend,
         note=f"{shot.place} {shot.note}".strip(),
         **readings,
     )

@@ -227,7 +227,7 @@ class _Dialect:
 
     def shots(self, block: _Block, names: _Names, turn_deg: float) -> Iterator[str]:
         """Yield the shots and passages of one survey of the hierarchy, without those inside."""
-        in_force, flags, c = InForce(), frozenset[str](), self.command
+        in_force, flags, c, extend = InForce(), frozenset[str](), self.command, ""
         for shot in (self.taken(one, turn_deg) for one in block.shots):
             stated = [name for name in shot.sigmas if name in self.sigmas]
             stated += [name for name in self.sigmas if f"{c}sd {name}" in in_force and name not in stated]
@@ -243,6 +243,9 @@ class _Dialect:
                 words = [*sorted(known - flags), *(f"not {flag}" for flag in sorted(flags - known))]
                 yield f"{c}flags {' '.join(words)}"
             flags = known
+            if not c and shot.extend != extend:
+                yield f"extend {shot.extend or 'normal'}"
+                extend = shot.extend
             ends = [names.local(name, block.path) if name else self.nameless(shot) for name in (shot.start, shot.end)]
             yield self.gap.join([*ends, *row.values(), f"{self.comment} {remark_of(shot)}"])
         for passage in block.passages:
