@@ -8,7 +8,9 @@ import pytest
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.survey import normal, report
 from buddyline.tools.survey.blunders import critical_chi2
+from buddyline.tools.survey.connected import Survey
 from buddyline.tools.survey.fit import SurveyFit, chance_of, detectable
+from buddyline.tools.survey.geodesy import grid_of
 from buddyline.tools.survey.network import adjust
 from buddyline.tools.survey.project import AdjustSettings, FixedPoint, Known, Place
 from buddyline.tools.survey.sheet import Sheet
@@ -335,3 +337,21 @@ def test_a_known_line_that_says_nothing_is_refused(known, said):
 def test_what_nothing_determines_is_a_known_error():
     with pytest.raises(BuddylineError, match="nothing observes"):
         normal.Normal((np.array([0]), np.array([0])), np.array([1.0]), np.array([1.0]), np.array([0, 1]))
+
+
+def test_dives_that_all_cross_are_eliminated_with_little_fill():
+    rng, n, legs = np.random.default_rng(5), 20, []
+    places_m = np.stack(
+        [*np.meshgrid(6.0 * np.arange(n), 6.0 * np.arange(n), indexing="ij"), np.full((n, n), 12.0)], -1
+    )
+    places_m += rng.normal(size=places_m.shape)
+    for dive in range(2 * n):
+        line = [(dive, k) if dive < n else (k, dive - n) for k in range(n)]
+        steps = [(k, k + 1, k % 2) for k in range(n - 1)]
+        course = world.SurveyCourse(np.array([places_m[at] for at in line]), steps, [f"{i}x{j}" for i, j in line])
+        legs += [replace(leg, dive=dive + 1) for leg in world.readings_of(course, rng)]
+    project = world.project_of(legs)
+    solved = Survey(project, grid_of(project)).adjust().normal
+    assert solved.count > normal.DENSE
+    # With each dive's instruments among its stations, as a survey of few loops has them, there are 497,000.
+    assert solved._lu.L.nnz < 300_000
