@@ -94,14 +94,17 @@ def shoot(
         depth = _depth(node, seen.below_port_m[i, index], *span_ns, settings)
         return End(node.info.node, azimuth, inclination, depth, field_of(node, *span_ns))
 
-    # The track's rows are smoothed: what their sigma says is nearly the same error in all of them.
-    mean_of = mean_of_white if readings.speed_mps is None else mean_of_slow
+    # The track's rows are smoothed: what their sigma says is nearly the same error in all of them. What they scatter by
+    # is how the nodes are held.
+    mean_of, scatter_m = mean_of_white, max(along_m, 1e-4)
+    if readings.speed_mps is not None:
+        mean_of, scatter_m = mean_of_slow, math.hypot(scatter_m, math.sqrt(2) * settings.centering_m)
     return Shot(
         start_ns=start_ns,
         end_ns=end_ns,
         distance=mean_of((seen.stamps_ns[index] - start_ns) / 1e9, range_m, along_m, floor_m),
         ends=(end(0, readings.pair[0]), end(1, readings.pair[1])),
-        range_spread=float(range_m.std(ddof=1)) / max(along_m, 1e-4) if len(index) > 2 else 0.0,
+        range_spread=float(range_m.std(ddof=1)) / scatter_m if len(index) > 2 else 0.0,
         heading_gap_rad=float(unwrapped(gaps).mean()) if len(gaps) else None,
         used=seen.triggers[index],
         unused=unused,
