@@ -54,6 +54,9 @@ def corrections(folders, out):
 def test_a_dive_s_folders_become_poses_track_and_report(folders, capsys):
     out = folders / "dive"
     assert main(["after", str(folders / "a"), str(folders / "b"), "-o", str(out)]) == 0
+    said = capsys.readouterr().err
+    for name in ("track.tum", "track.csv"):
+        assert said.count(f"{out / name}: the track (smooth)") == 1
     assert {path.name for path in out.iterdir()} == {
         "clocks.json",
         "solved.mcap",

@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         what, lines = _network_lines(args) if of_net else _lines(args, _of_pair(args))
         _write_text(args.output, lines)
-    print(f"{', '.join(args.logs)}: {what}", file=sys.stderr)
+    print(f"{args.output or ', '.join(args.logs)}: {what}", file=sys.stderr)
     return 0
 
 
