@@ -14,7 +14,8 @@ from typing import Final
 
 from buddyline.tools.measure.load import Load, load_of
 
-END_WITHIN_S: Final = 1.5
+# Long, because on a loaded machine a child waits for a processor; one that is killed leaves a log without its end.
+END_WITHIN_S: Final = 10.0
 LAST_BYTES: Final = 4096
 
 _LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
