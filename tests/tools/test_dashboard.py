@@ -16,6 +16,7 @@ from buddyline.protocol.codec import encode
 from buddyline.protocol.envelope import open_envelope
 from buddyline.protocol.messages import Message
 from buddyline.protocol.topics import key_of
+from buddyline.tools.demo import command
 from buddyline.tools.demo.command import _show
 from buddyline.tools.demo.dashboard import Dashboard, summary_text
 from buddyline.tools.draw.above import ASCII_ARROWS
@@ -125,6 +126,25 @@ def test_screens_follow_each_other_without_a_line_s_end(monkeypatch):
     assert text.count("\x1b[J\x1b[H") >= 1
     assert text.count("\x1b[J\n") == 1
     assert text.endswith("\x1b[J\n")
+
+
+def test_the_seconds_count_from_the_first_answered_trigger(monkeypatch):
+    watch, looks = WatchedPair(), []
+
+    def wait(_: float) -> bool:
+        looks.append(None)
+        assert len(looks) < 9
+        if len(looks) == 3:
+            watch.take(rejection(0))
+        return False
+
+    service = SimpleNamespace(stop=SimpleNamespace(wait=wait))
+    assert _show(service, watch.dashboard, 1e-9)
+    assert len(looks) >= 3
+    monkeypatch.setattr(command, "BEGINS_WITHIN_S", 0.0)
+    looks.clear()
+    assert _show(service, WatchedPair().dashboard, 1e-9), "nothing came: it is over all the same"
+    assert len(looks) < 3
 
 
 @pytest.mark.parametrize("no_color", ["", "1"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import math
 import os
 import shutil
 import sys
@@ -32,11 +33,15 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LOOK_S: Final = 0.1
+# A loaded machine takes a while until the first trigger is answered. A demo of some seconds ends where none ever is.
+BEGINS_WITHIN_S: Final = 300.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("--seconds", type=above_zero, metavar="S", help="end after this long; default: at Ctrl-C")
+    parser.add_argument(
+        "--seconds", type=above_zero, metavar="S", help="end so long after the first trigger; default: at Ctrl-C"
+    )
     parser.add_argument("--environment", default="cavern", choices=ENVIRONMENTS, help="the waters; default: cavern")
     parser.add_argument("--seed", type=int, default=1, help="each seed gives another dive; default: 1")
     parser.add_argument("--rate", type=above_zero, default=10.0, metavar="HZ", help="triggers a second; default: 10")
@@ -228,7 +233,7 @@ def _cpu_seconds(children: list[Child]) -> dict[str, float]:
 
 def _show(service: Service, dashboard: Dashboard | TeamDashboard, seconds: float | None) -> bool:
     """Show the state until the end; return True if the time was over, False if the demo was stopped."""
-    ends_s = None if seconds is None else time.monotonic() + seconds
+    begun, ends_s = False, math.inf if seconds is None else time.monotonic() + BEGINS_WITHIN_S
     interactive = sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
     coloured = not os.environ.get("NO_COLOR")
     arrows = ARROWS if "utf" in (sys.stderr.encoding or "").lower() else ASCII_ARROWS
@@ -241,7 +246,9 @@ def _show(service: Service, dashboard: Dashboard | TeamDashboard, seconds: float
             text = dashboard.line()
         # A line's end below a full screen would move it up, its title out of sight.
         print(text, file=sys.stderr, flush=True, end="" if interactive else "\n")
-        over = ends_s is not None and time.monotonic() >= ends_s
+        if seconds is not None and not begun and dashboard.begun:
+            begun, ends_s = True, time.monotonic() + seconds
+        over = time.monotonic() >= ends_s
     if interactive:
         print(file=sys.stderr)
     return over

@@ -93,6 +93,11 @@ class Dashboard:
         for topic in (POSE, TRACK, TRACK_LAG, REJECTED, SOLVER_STATUS, NODE_STATUS):
             follow(bus, topic.key_any(), refusals, self.take)
 
+    @property
+    def begun(self) -> bool:
+        """Whether a trigger has been answered, by a pose or a rejection."""
+        return self._newest_trigger >= 0
+
     def take(self, envelope: Envelope) -> None:
         """Take one message off the bus."""
         message = envelope.message

@@ -69,6 +69,11 @@ class TeamDashboard:
         for topic in (NET_POSE, POSE, REJECTED, SOLVER_STATUS):
             follow(bus, topic.key_any(), refusals, self.take)
 
+    @property
+    def begun(self) -> bool:
+        """Whether a trigger of any pair has been answered, by a pose or a rejection."""
+        return bool(self._first)
+
     def take(self, envelope: Envelope) -> None:
         """Take one message off the bus."""
         message = envelope.message
