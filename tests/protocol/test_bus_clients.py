@@ -118,7 +118,20 @@ def test_closing_lets_the_handler_finish_the_queue(client: Connect) -> None:
     for trigger in range(200):
         publisher.put(rejected(trigger))
     wait_until_heard(client(), "buddyline/pair/a/b/rejected", 200)
-    client().subscribe("buddyline/pair/a/b/rejected", inbox).close()
+    go_on, arrived = threading.Event(), list[bytes]()
+
+    def slow(received: Received) -> None:
+        assert go_on.wait(PATIENCE_S)
+        inbox(received)
+
+    subscription = client().subscribe(
+        "buddyline/pair/a/b/rejected", slow, on_arrival=lambda _, payload: arrived.append(payload)
+    )
+    until(lambda: len(arrived) == 200)
+    closing = threading.Thread(target=subscription.close)
+    closing.start()
+    go_on.set()
+    closing.join(PATIENCE_S)
     assert triggers(inbox) == list(range(200))
 
 

@@ -21,6 +21,7 @@ from buddyline.tools.doctor import bus, diagnosis, machine, rig
 from buddyline.tools.health.finding import Finding, status_of
 from msgspec import UNSET
 
+from tests.processes import PATIENCE_S
 from tests.tools.test_health import CALIBRATION, EXAMPLES, INFO_A, REST, status
 
 
@@ -166,6 +167,9 @@ def test_a_check_that_hangs_or_fails_is_named_and_hides_no_other(capsys, monkeyp
 @pytest.mark.parametrize("name", ["a", "b"])
 def test_a_simulated_rig_has_no_problem(name, monkeypatch):
     monkeypatch.setattr(rig, "LISTEN_S", 1.0)
+    # A loaded machine takes longer until the exposure is locked, and until all sensors are heard.
+    monkeypatch.setattr(rig, "FRAMES_WITHIN_S", PATIENCE_S)
+    monkeypatch.setattr(rig, "SENSE_S", PATIENCE_S)
     config = load_node_config(EXAMPLES / f"{name}.toml")
     with monkeypatch.context() as patched:
         # The other node swims: at this instant it is in view.

@@ -339,6 +339,7 @@ def run(*words):
     return command.run(parser.parse_args([str(word) for word in words]))
 
 
+@CAVERN
 def test_fixed_points_without_legs_go_in_and_out(tmp_path, capsys):
     (tmp_path / "peaks.svx").write_text(
         "*cs UTM33N\n*cs out UTM33N\n*cs out UTM60S\n*fix top 412345 5187654 1820\n*fix hut 412600 5187000 1400\n"
