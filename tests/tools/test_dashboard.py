@@ -128,23 +128,23 @@ def test_screens_follow_each_other_without_a_line_s_end(monkeypatch):
     assert text.endswith("\x1b[J\n")
 
 
-def test_the_seconds_count_from_the_first_answered_trigger(monkeypatch):
+def test_the_seconds_count_from_both_nodes_first_pictures(monkeypatch):
     watch, looks = WatchedPair(), []
 
     def wait(_: float) -> bool:
         looks.append(None)
         assert len(looks) < 9
-        if len(looks) == 3:
-            watch.take(rejection(0))
+        if len(looks) in (2, 4):
+            watch.take(rejection(0, "unmatched" if len(looks) == 2 else "ambiguous"))
         return False
 
     service = SimpleNamespace(stop=SimpleNamespace(wait=wait))
     assert _show(service, watch.dashboard, 1e-9)
-    assert len(looks) >= 3
+    assert len(looks) >= 4
     monkeypatch.setattr(command, "BEGINS_WITHIN_S", 0.0)
     looks.clear()
     assert _show(service, WatchedPair().dashboard, 1e-9), "nothing came: it is over all the same"
-    assert len(looks) < 3
+    assert len(looks) < 4
 
 
 @pytest.mark.parametrize("no_color", ["", "1"])

@@ -33,14 +33,14 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LOOK_S: Final = 0.1
-# A loaded machine takes a while until the first trigger is answered. A demo of some seconds ends where none ever is.
+# A loaded machine takes a while until both nodes send pictures. A demo of some seconds ends where they never do.
 BEGINS_WITHIN_S: Final = 300.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument(
-        "--seconds", type=above_zero, metavar="S", help="end so long after the first trigger; default: at Ctrl-C"
+        "--seconds", type=above_zero, metavar="S", help="end so long after both first pictures; default: at Ctrl-C"
     )
     parser.add_argument("--environment", default="cavern", choices=ENVIRONMENTS, help="the waters; default: cavern")
     parser.add_argument("--seed", type=int, default=1, help="each seed gives another dive; default: 1")

@@ -95,8 +95,9 @@ class Dashboard:
 
     @property
     def begun(self) -> bool:
-        """Whether a trigger has been answered, by a pose or a rejection."""
-        return self._newest_trigger >= 0
+        """Whether both pictures of a trigger have come to the solver."""
+        with self._lock:
+            return bool(self._poses or self._rejected.keys() - {"unmatched"})
 
     def take(self, envelope: Envelope) -> None:
         """Take one message off the bus."""

@@ -71,8 +71,9 @@ class TeamDashboard:
 
     @property
     def begun(self) -> bool:
-        """Whether a trigger of any pair has been answered, by a pose or a rejection."""
-        return bool(self._first)
+        """Whether both pictures of a trigger have come to the solver, of any pair."""
+        with self._lock:
+            return any(self._pairs.values()) or bool(self._reasons.keys() - {"unmatched"})
 
     def take(self, envelope: Envelope) -> None:
         """Take one message off the bus."""
