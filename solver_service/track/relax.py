@@ -258,7 +258,8 @@ class PathPass(TrackSteps):
         if rows:
             H, y = np.concatenate([each[0] for each in rows]), np.concatenate([each[1] for each in rows])
             noise = np.diag(np.concatenate([each[2] for each in rows]))
-            error, chi2 = told_by(main, H, y - H @ self._off, noise, teaches=bool(lights))
+            others = len(y) - 2 * len(lights)
+            error, chi2 = told_by(main, H, y - H @ self._off, noise, teaches=bool(lights), others=others)
             self._off = self._off + error
             if lights:
                 main.surprise += chi2

@@ -218,10 +218,12 @@ class TrackSights(TrackMoves):
         return chi2
 
 
-def told_by(estimate: Estimate, H: Floats, y: Floats, noise: Floats, *, teaches: bool) -> tuple[Floats, float]:
+def told_by(
+    estimate: Estimate, H: Floats, y: Floats, noise: Floats, *, teaches: bool, others: int = 0
+) -> tuple[Floats, float]:
     """Update all but an estimate's state; give the error (SIZE,) to add to that, and chi^2 of the residuals y (m,).
 
-    teaches: whether shaking and shares learn.
+    teaches: whether shaking and shares learn. others: how many rows, the first ones, are not of lights.
     """
     before = estimate.covariance
     error, estimate.covariance, chi2, S_inverse, gain = anchors.kalman(before, H, y, noise)
@@ -233,11 +235,12 @@ def told_by(estimate: Estimate, H: Floats, y: Floats, noise: Floats, *, teaches:
     if estimate.follows_walk:
         learns = before[CLOCK, CLOCK] < KNOWN_CLOCK_S**2 and not (estimate.wide and any(estimate.without))
         estimate.walking = estimate.walking.taught(y, S_inverse, H, gain, learns=learns)
-    # Depth and attitudes remove little of what shaking adds: to follow that would not be worth its time.
+    # Depth and attitudes remove little of what shaking adds: to follow that would not be worth its time. Without the
+    # gauges' offset, which is not followed, depth would even add to it, more each time.
     if teaches:
         moving = H[:, :MOVING]
         estimate.shaking = estimate.shaking.taught(y, S_inverse, moving[:, :NAV], estimate.shaken[:, :NAV, :NAV])
-        rest = _STILL - gain[:MOVING] @ moving
+        rest = _STILL - gain[:MOVING, others:] @ moving[others:]
         estimate.shaken = rest @ estimate.shaken @ rest.T
     return error, chi2
 

@@ -1,18 +1,21 @@
 """Passes about a path: they end where the dive says, not where the path was; one lamp of each node is enough."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.track import relax, seeing
 from buddyline.solver_service.track.dive import smooth
+from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.lights import COLUMNS, Sight
 from buddyline.solver_service.track.parts import parts_of
 from buddyline.solver_service.track.records import feed, pass_over
 from buddyline.solver_service.track.relax import PassedOver, PathPass
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.smoother import Path, smoothed
-from buddyline.solver_service.track.state import NAV, PHI, R_, SIZE
+from buddyline.solver_service.track.state import MOVING, NAV, PHI, R_, SIZE
 from buddyline.solver_service.track.walking import Walking
 
 from tests.solver_service.track.assignments import weigh
@@ -55,6 +58,22 @@ def test_passes_about_a_path_that_is_off_end_at_the_same_path() -> None:
     for _ in range(3):
         path = passed_about(dive, path)
     assert moved(path, right) < 0.01
+
+
+def test_what_shaking_adds_to_the_covariance_stays_a_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Depths beside lights once made it grow without end: a dive of seven minutes lost its track."""
+    shares: list[float] = []
+
+    def told_by(estimate: Estimate, H: Floats, y: Floats, noise: Floats, **options: Any) -> tuple[Floats, float]:
+        told = seeing.told_by(estimate, H, y, noise, **options)
+        shaken = np.diagonal(estimate.shaken, axis1=1, axis2=2)
+        shares.append(float((shaken / np.diag(estimate.covariance)[:MOVING]).max()))
+        return told
+
+    monkeypatch.setattr(relax, "told_by", told_by)
+    dive = make(5, Setting(seconds=40.0))
+    assert smooth(dive.records, dive.fixes, dive.stamps_ns).rows
+    assert max(shares) < 1.001
 
 
 def test_a_path_may_go_on_after_the_last_picture() -> None:
