@@ -5,9 +5,11 @@ import signal
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
+from buddyline.protocol.clock import S_NS
 from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
-from buddyline.protocol.messages import Rejected, RelativePose
+from buddyline.protocol.messages import Candidates, Rejected, RelativePose
 from buddyline.tools.dives import Dive
 
 from tests.processes import Process, buddyline, free_endpoint, recorded_solver, until
@@ -43,6 +45,9 @@ def children_of(pid):
 @pytest.fixture
 def two_logs(tmp_path):
     messages, _ = dive_messages(seconds=4.0, seed=7, miss_share=0.05, imu=True)
+    # Sensors go on after the last frames: live, which of the last samples come before a frame's turn is chance.
+    last_ns = max(message.stamp_ns for message in messages if isinstance(message, Candidates)) - S_NS // 2
+    messages = [one for one in messages if not isinstance(one, Candidates) or one.stamp_ns <= last_ns]
     for node in ("a", "b"):
         with DiveLogWriter(tmp_path / f"{node}.mcap") as writer:
             for message in messages:
@@ -66,7 +71,15 @@ def test_live_playback_gives_the_offline_poses(tmp_path, two_logs, speed):
         assert record.end(signal.SIGINT) == 130
     live, counts = results_of(recorded)
     assert sorted(live) == sorted(expected)
-    assert_same_outcomes(map(live.get, sorted(live)), map(expected.get, sorted(live)))
+    both = [(live[trigger], expected[trigger]) for trigger in sorted(live)]
+    if speed == "1":
+        assert_same_outcomes(*zip(*both, strict=True))
+    # All at once, it is chance on a loaded machine whether the attitude right after a frame comes before its turn.
+    for found, wanted in both:
+        assert type(found) is type(wanted)
+        if isinstance(found, RelativePose):
+            off_m, covariance = np.subtract(found.t_a_b_m, wanted.t_a_b_m), np.reshape(wanted.covariance, (6, 6))
+            assert off_m @ np.linalg.solve(covariance[:3, :3], off_m) < 0.1**2
     assert set(counts.values()) == {1}
     with DiveLogReader(recorded) as reader:
         assert reader.damage == []

@@ -19,7 +19,7 @@ from buddyline.tools.survey.lines import Line, line_of, measures_of
 from buddyline.tools.survey.observations import Solution
 from buddyline.tools.survey.project import Leg, Project
 from buddyline.tools.survey.proposals import Proposal, proposals
-from buddyline.tools.survey.swims import Path, paths_of
+from buddyline.tools.survey.swims import SwumWay, paths_of
 from msgspec import UNSET
 
 Triple: TypeAlias = tuple[float, float, float]
@@ -103,7 +103,7 @@ class Adjusted:
         return residuals_of(self.survey, self.solution, self.lines, self.loops)
 
     @cached_property
-    def paths(self) -> list[Path]:
+    def paths(self) -> list[SwumWay]:
         """The ways that were swum between stations."""
         return paths_of(self.survey.project, self.solution, self.survey.origin_m)
 

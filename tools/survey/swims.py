@@ -33,7 +33,7 @@ LEAST_RUN_M: Final = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Path:
+class SwumWay:
     """A swim in the adjusted survey: seconds (n,) since its start, east, north, up (n, 3), covariances (n, 3, 3)."""
 
     swim: Swim
@@ -119,7 +119,7 @@ def _spreads(track: PairReadings) -> tuple[Floats, Floats]:
     return np.sqrt(np.maximum(along, 0.0)), np.sqrt(np.maximum(across, 0.0))
 
 
-def paths_of(project: Project, solution: Solution, origin_m: Floats) -> list[Path]:
+def paths_of(project: Project, solution: Solution, origin_m: Floats) -> list[SwumWay]:
     """Return the swims between adjusted stations. origin_m: (3,), to which the solution is relative."""
     at = solution.observations.at
     known = [swim for swim in project.swim if {swim.station, swim.from_, swim.to} <= set(at)]
@@ -134,11 +134,11 @@ def paths_of(project: Project, solution: Solution, origin_m: Floats) -> list[Pat
         joint = solution.normal.inverse(columns) if whole is None else whole[np.ix_(place, place)]
         path = _hung(swim, solution.position_m[of], joint, project.settings)
         if path is not None:
-            found.append(Path(swim, path.seconds, path.position_m + origin_m, path.covariance))
+            found.append(SwumWay(swim, path.seconds, path.position_m + origin_m, path.covariance))
     return found
 
 
-def _hung(swim: Swim, places_m: Floats, joint: Floats, settings: SurveySettings) -> Path | None:
+def _hung(swim: Swim, places_m: Floats, joint: Floats, settings: SurveySettings) -> SwumWay | None:
     """Hang a swim between its stations (3, 3): the standing node's, the first and the last; joint: (9, 9), of them.
 
     On the map a complex number c turns (and scales) the way to the leg at either end, and in between c goes evenly in
@@ -181,4 +181,4 @@ def _hung(swim: Swim, places_m: Floats, joint: Floats, settings: SurveySettings)
     covariance += along_m[:, None, None] ** 2 * ray + across[:, None, None] * (np.eye(3) - ray)
     covariance += settings.centering_m**2 * np.eye(3)
     covariance[:, 2, 2] += (math.radians(settings.tilt_floor_deg) * range_m) ** 2
-    return Path(swim, seconds, position_m, covariance)
+    return SwumWay(swim, seconds, position_m, covariance)

@@ -136,7 +136,7 @@ def _turn(
 
 
 @dataclass(frozen=True, eq=False)
-class Carried:
+class CarriedAttitude:
     """A node's attitude from one rest to the next, by its gyroscope: q (m, 4), body to the first body, at at_ns (m,).
 
     levels: (2, 4), of each rest: from the first body to x ahead, z down. between_ns: end of the first rest, begin of
@@ -159,7 +159,7 @@ class Carried:
         return rotate(normalized((1 - share) * self.levels[0] + share * self.levels[1]), rotate(self.q[index], vectors))
 
 
-def carry(node: NodeReadings, zero: Floats, before_ns: Ints, after_ns: Ints) -> Carried | None:
+def carry(node: NodeReadings, zero: Floats, before_ns: Ints, after_ns: Ints) -> CarriedAttitude | None:
     """Carry a node's attitude through two rests, by their fixes' stamps; None where its samples have gaps."""
     imu = node.imu
     part = imu.between(int(before_ns[0]), int(after_ns[-1]))
@@ -175,7 +175,7 @@ def carry(node: NodeReadings, zero: Floats, before_ns: Ints, after_ns: Ints) -> 
         levels.append(_levelling(rotate(q[first : last + 1], accel[first : last + 1]).mean(axis=0)))
     if levels[0] @ levels[1] < 0:
         levels[1] = -levels[1]
-    return Carried(at_ns, q, np.array(levels), (int(before_ns[-1]), int(after_ns[0])))
+    return CarriedAttitude(at_ns, q, np.array(levels), (int(before_ns[-1]), int(after_ns[0])))
 
 
 def _levelling(up: Floats) -> Floats:
