@@ -47,7 +47,8 @@ from buddyline.solver_service.track.walking import Walking, joint
 
 # The clocks' offset, 1 sd, where a node has no inertial unit, so that no pass estimates it.
 CLOCK_WITHOUT_S: Final = 0.003
-# A pass that finds the clocks' offset off (`clock_left_ns`) is repeated with it, CLOCK_ROUNDS passes at most.
+# A pass that finds the clocks' offset off (`clock_left_ns`) is repeated with it, in CLOCK_ROUNDS passes at most, and
+# where the best of those that were tried has some left then, in as many more.
 CLOCK_ROUNDS: Final = 4
 # A track that began without a fix, and is carried back by more than this, is passed over until that settles.
 LATE_S: Final = 2.0
@@ -81,8 +82,8 @@ def smooth(
 ) -> Smoothed:
     """Give the whole dive's track at outputs_ns.
 
-    clock_ns: how far B's clock is believed ahead. again: where the passes over the dive contradict the first one, begin
-    once more with the offset that they found, which is nearer than the first one's false one.
+    clock_ns: how far B's clock is believed ahead. again: whether to begin once more where the later passes contradict
+    the first one: with the offset that they found, which is nearer than that of the first.
     """
     records, fixes = (parted(in_order(records[0])), parted(in_order(records[1]))), sorted(fixes, key=stamp_of)
     told_ns = clock_ns
@@ -200,7 +201,7 @@ def _first_pass(
     """Give a filter that has passed over a dive up to stop_ns, its tracks, and how far B's clock was believed ahead.
 
     Where that gives tracks in pieces other offsets are tried, and the one that explains most is taken. With units off
-    their mounts each round finds a part of the offset: what is left of it then is worth as many rounds again.
+    their mounts each pass finds only a part of the offset, so the best is repeated while some is left.
     """
     best = _rounds(records, fixes, clock_ns, stop_ns)
     for try_s in CLOCK_TRIES_S:

@@ -66,7 +66,7 @@ LEAST_TOLD: Final = 0.5
 # over again with what they found: of an offset they find a part. Further off, the path is no place to be linear about.
 LEFT_CLOCK_S: Final = 0.002
 LEFT_SIGMAS: Final = 2.0
-FAR_CLOCK_S: Final = 0.02
+LOST_CLOCK_S: Final = 0.02
 # Noise and units are judged by the samples of two seconds.
 KEPT_S: Final = 3.0
 
@@ -318,7 +318,7 @@ def settled(
         if _stays(old, path, DOUBTFUL_SIGMAS if doubtful else STAYS_SIGMAS):
             left_s = path.state(-1).clock_s
             # What a doubtful track tells of the clocks is little, and less than it believes.
-            if not doubtful and max(LEFT_CLOCK_S, LEFT_SIGMAS * clock_sigma_s(path)) < abs(left_s) < FAR_CLOCK_S:
+            if not doubtful and max(LEFT_CLOCK_S, LEFT_SIGMAS * clock_sigma_s(path)) < abs(left_s) < LOST_CLOCK_S:
                 known, path = replace(known, clock_ns=known.clock_ns + round(left_s * 1e9)), path.later(left_s)
                 continue
             fits = passed.surprise < UNFIT * passed.told and sum(passed.told_by) > LEAST_TOLD * told

@@ -13,8 +13,8 @@ from buddyline.protocol.clock import ManualClock
 from buddyline.protocol.codec import encode
 from buddyline.protocol.envelope import Envelope, Refusals
 from buddyline.protocol.errors import MessageError
-from buddyline.protocol.messages import Candidates, Message, Rejected, RelativePose
-from buddyline.protocol.topics import TOPICS, key_of
+from buddyline.protocol.messages import Candidates, Message, Rejected, RelativePose, Truth
+from buddyline.protocol.topics import TRUTH, key_of
 from buddyline.tools.bridge.http_api import Answers
 from buddyline.tools.bridge.mavlink import KINDS, MavlinkTranslation
 from buddyline.tools.bridge.nmea import sentences
@@ -57,9 +57,7 @@ def told(draw: st.DrawFn) -> list[Received]:
 
 
 def _key(message: Message) -> str:
-    truth = next((topic for topic in TOPICS if topic.name == "truth"), None)
-    assert truth is not None
-    return truth.key("a", "b") if type(message) is truth.schema else key_of(message)
+    return TRUTH.key("a", "b") if isinstance(message, Truth) else key_of(message)
 
 
 def _bridge() -> Callable[[Envelope], None]:

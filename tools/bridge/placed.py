@@ -245,13 +245,14 @@ class Placing:
 
 def _is_sound(placed: Placed) -> bool:
     """Return whether all numbers are finite, and such that every receiver's format can say them."""
-    lengths = [values for values in (placed.p_ned_m, placed.v_ned_mps) if values is not None]
-    squares = [values for values in (placed.covariance, placed.v_covariance) if values is not None]
-    return (
-        all(bool((np.abs(values) <= MOST).all()) for values in lengths)
-        and all(bool((np.abs(values) <= MOST**2).all()) for values in squares)
-        and bool(np.isfinite(placed.R_ned_body).all())
+    limited = (
+        (placed.p_ned_m, MOST),
+        (placed.v_ned_mps, MOST),
+        (placed.R_ned_body, MOST),
+        (placed.covariance, MOST**2),
+        (placed.v_covariance, MOST**2),
     )
+    return all(values is None or bool((np.abs(values) <= most).all()) for values, most in limited)
 
 
 def _about_down(angle_rad: float) -> Floats:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LOOK_S: Final = 0.1
-# A loaded machine takes a while until both nodes send pictures. A demo of some seconds ends where they never do.
+# A loaded machine takes a while until both nodes send pictures. Where none come for so long, `--seconds` ends it, too.
 BEGINS_WITHIN_S: Final = 300.0
 
 

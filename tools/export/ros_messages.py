@@ -41,10 +41,9 @@ END_OF_ROS_TIME_NS: Final = 2**31 * S_NS
 R_FRD_FLU: Final = np.diag([1.0, -1.0, -1.0])
 # Variance of a field that was not measured: large, so that filters ignore the field.
 UNKNOWN_VARIANCE: Final = 1e6
-# A greater one has no finite square.
-MOST_SIGMA: Final = 1e150
-# Range has numbers of single precision.
+# Range has numbers of single precision; the square of a greater sigma is none.
 MOST_SINGLE: Final = float(np.finfo(np.float32).max)
+MOST_SIGMA: Final = 1e19
 
 POSE_TYPE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
 ODOMETRY_TYPE: Final = "nav_msgs/msg/Odometry"
@@ -183,7 +182,7 @@ class Translation:
             min_range=MIN_RANGE_M,
             max_range=MAX_RANGE_M,
             range=min(estimate.range_m, MOST_SINGLE),
-            variance=min(min(range_sigma_m(estimate), MOST_SIGMA) ** 2, MOST_SINGLE),
+            variance=min(range_sigma_m(estimate), MOST_SIGMA) ** 2,
         )
         return RosMessage(f"/buddyline/{a}/{b}/range", RANGE_TYPE, value)
 

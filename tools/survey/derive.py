@@ -180,10 +180,11 @@ class _Chain:
         self.readings, self.marks, self.settings, self.limits, self.dive = readings, marks, settings, limits, dive
         self.seen = sights(readings, settings)
         self.placed: list[Mark] = []
-        every = (pauses if settings.pause_s else rests)(readings, self.seen, settings)
-        least = f"{settings.rest_s:g} s with {settings.rest_fixes} fixes"
         if settings.pause_s:
-            least = f"{settings.pause_s:g} s by the track"
+            every, least = pauses(readings, self.seen, settings), f"{settings.pause_s:g} s by the track"
+        else:
+            every = rests(readings, self.seen, settings)
+            least = f"{settings.rest_s:g} s with {settings.rest_fixes} fixes"
         for rest in every:
             if rest.too_short:
                 out.add_problem(f"NO LEG: rest at {time_text(rest.start_ns)}: {rest.too_short}; a leg takes {least}")
@@ -213,9 +214,8 @@ class _Chain:
             legs.append(replace(leg, alarms=[*leg.alarms, *doubts]))
         used = [np.isin(self.seen.triggers, shot.used) for shot in shots]
         self.turns = turns_of(readings, used, dive, settings)
-        self.swims = swims_of(
-            self.readings, used, [one.station for one in self.standings], self.turns, self.dive, self.settings
-        )
+        named = [one.station for one in self.standings]
+        self.swims = swims_of(readings, used, named, self.turns, dive, settings)
         self.legs = alarms.disturbed_alike(legs, [alarms.off_fields(shot, self.usual, limits) for shot in shots])
 
     def _named(self, out: Derived, corrected: set[int]) -> list[dict[str, str]]:

@@ -121,8 +121,9 @@ def geopackage(sheet: Sheet) -> bytes:
             (f"{organization}:{number}", number, organization, number, wkt) for number, organization, wkt in systems
         ]
         base.executemany("INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, NULL)", listed)
-        for table, shape, count in (("stations", "POINT", 1), ("lines", "LINESTRING", 2)):
-            own = [one for one in features if (len(one[2]) == 1) is (count == 1)]
+        points = [one for one in features if len(one[2]) == 1]
+        lines = [one for one in features if len(one[2]) > 1]
+        for table, shape, own in (("stations", "POINT", points), ("lines", "LINESTRING", lines)):
             every = _all(own)[:, :2]
             bounds = [*every.min(axis=0).tolist(), *every.max(axis=0).tolist()]
             base.execute(f"CREATE TABLE {table} (id INTEGER PRIMARY KEY, geom {shape}, name TEXT, kind TEXT)")

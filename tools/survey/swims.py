@@ -128,14 +128,12 @@ def paths_of(project: Project, solution: Solution, origin_m: Floats) -> list[Swu
     every = np.unique(unknowns)
     # Of few stations the inverse is made once.
     whole = solution.normal.inverse(every) if len(every) <= DENSE else None
-    found = []
+    found: list[SwumWay | None] = []
     for swim, of, columns in zip(known, stations, unknowns, strict=True):
         place = np.searchsorted(every, columns)
         joint = solution.normal.inverse(columns) if whole is None else whole[np.ix_(place, place)]
-        path = _hung(swim, solution.position_m[of], joint, project.settings)
-        if path is not None:
-            found.append(SwumWay(swim, path.seconds, path.position_m + origin_m, path.covariance))
-    return found
+        found.append(_hung(swim, solution.position_m[of] + origin_m, joint, project.settings))
+    return [way for way in found if way is not None]
 
 
 def _hung(swim: Swim, places_m: Floats, joint: Floats, settings: SurveySettings) -> SwumWay | None:
