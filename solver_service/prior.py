@@ -49,6 +49,7 @@ class PosePrior:
         self._T_a_b = SE3.identity()
         self._rates = np.zeros(6)
         self._P = np.zeros((12, 12))
+        self._agreed = 0
         self._last: tuple[tuple[int, int], tuple[SE3, Floats]] | None = None
 
     def reset(self) -> None:
@@ -60,7 +61,7 @@ class PosePrior:
         if self._stamp_ns is None or not 0 <= stamp_ns - self._stamp_ns <= LIFETIME_NS:
             return None
         T_a_b, P = self._predicted(self._stamp_ns, stamp_ns)
-        return Prior(T_a_b, P[:6, :6], self._rates, P[6:, 6:])
+        return Prior(T_a_b, P[:6, :6], self._rates, P[6:, 6:], self._agreed)
 
     def update(self, stamp_ns: int, fix: Fix) -> None:
         """Update the filter with a fix; restart it with the fix if that is outside the gate."""
@@ -76,13 +77,14 @@ class PosePrior:
             return
         step = gain @ innovation
         self._stamp_ns, self._last = stamp_ns, None
+        self._agreed += 1
         self._T_a_b = T_a_b.retract(step[:6])
         self._rates = self._rates + step[6:]
         P = P - gain @ P[:6]
         self._P = (P + P.T) / 2
 
     def _start(self, stamp_ns: int, fix: Fix) -> None:
-        self._stamp_ns, self._last = stamp_ns, None
+        self._stamp_ns, self._last, self._agreed = stamp_ns, None, 0
         self._T_a_b, self._rates = fix.T_a_b, np.zeros(6)
         self._P = np.diag((0.0,) * 6 + (SPEED_MPS**2,) * 3 + (TURN_RADPS**2,) * 3)
         self._P[:6, :6] = fix.covariance

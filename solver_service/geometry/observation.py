@@ -110,12 +110,14 @@ class Prior:
     """A prediction from earlier fixes for this instant, its covariance (6, 6) widened for the time since.
 
     rates: (6,) velocity (m/s) and turn (rad/s) of B in A's camera frame, with covariance (6, 6); None: unknown.
+    agreed: how many fixes in a row have agreed with those before.
     """
 
     T_a_b: SE3
     covariance: Floats
     rates: Floats | None = None
     rates_covariance: Floats | None = None
+    agreed: int = 0
 
 
 @dataclass(frozen=True)

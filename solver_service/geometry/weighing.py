@@ -82,7 +82,7 @@ class Weighed:
 def weigh_readings(read: Read, trigger: int, past: Past, settings: Settings, *, three: bool) -> Weighed:
     """Apply the past to the readings of one trigger; three: of three lights, so that no gap is left."""
     poses, of_trigger, places = read.poses, read.poses_of(trigger), read.places_of(trigger)
-    log_prior = past.weigh(poses.T_a_b[of_trigger])
+    log_prior = past.weigh(poses.T_a_b[of_trigger], three=three)
     log_past = log_prior
     if past.heading is not None and "attitude" in settings.checks:
         turned = poses.turn[:, of_trigger], poses.log_heading[of_trigger], poses.turn_variance[of_trigger]

@@ -2,12 +2,24 @@
 
 import numpy as np
 import pytest
+from buddyline.node.sim import dive as simulation
+from buddyline.node.sim.scenario import DivePlan, Scenario
+from buddyline.node.sim.world import World
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.messages import RelativePose, Truth
+from buddyline.solver_service.core import SolverCore
+from buddyline.solver_service.geometry.observation import Settings
+from buddyline.solver_service.geometry.past import Past
+from buddyline.solver_service.geometry.rig import pair_of
 from buddyline.solver_service.geometry.rotation import rotation_exp
 from buddyline.solver_service.geometry.se3 import SE3
 from buddyline.solver_service.geometry.trigger import Fix
 from buddyline.solver_service.prior import LIFETIME_NS, PosePrior
 
+from tests.solver_service.scenes import IDEAL
+
 STEP_NS = 100_000_000
+START_NS = 1_764_000_000 * S_NS
 
 
 def fix(t_a_b_m, R_a_b, covariance):
@@ -91,3 +103,29 @@ def test_a_fix_elsewhere_starts_it_anew():
     predicted = prior.predict(stamp_ns + STEP_NS)
     assert predicted.T_a_b.t_m == pytest.approx(elsewhere.t_a_b_m)
     assert not predicted.rates.any()
+    assert predicted.agreed == 0
+
+
+def test_the_more_fixes_agreed_the_less_a_pose_out_of_reach_is_worth():
+    prior = PosePrior()
+    losses = []
+    for stamp_ns, t, R, seen in list(moving(1, np.random.default_rng(5)))[:8]:
+        prior.update(stamp_ns, seen)
+        past = Past.of(prior.predict(stamp_ns + STEP_NS), None, 1e-6, pair_of(IDEAL, IDEAL), Settings())
+        away = SE3(R[None], t[None] + np.array((0.0, 6.0, 0.0)))
+        assert past.weigh(away, three=True) == pytest.approx(np.log(0.15))
+        losses.append(past.weigh(away, three=False)[0] / np.log(0.15))
+    assert losses == pytest.approx([1, 2, 3, 4, 5, 6, 6, 6])
+
+
+def test_no_pose_jumps_by_metres_in_a_tenth_of_a_second():
+    """Of one node's left light alone in the picture, and false candidates beside it."""
+    world = World(Scenario(seed=312, environment="lake", start_ns=START_NS))
+    core = SolverCore(Settings(), [("a", "b")])
+    spoken = [one for _, _, one in simulation.messages(world, DivePlan(seconds=40.0, rate_hz=10.0))]
+    told = [one for one in spoken if one.stamp_ns < START_NS + 7 * S_NS and not isinstance(one, Truth)]
+    poses = [one for one in [*core.handle_many(told), *core.flush()] if isinstance(one, RelativePose)]
+    assert len(poses) > 20
+    for pose in poses:
+        truth = world.truth(pose.stamp_ns, pose.trigger)
+        assert pose.t_a_b_m == pytest.approx(truth.t_a_b_m, abs=0.5)
