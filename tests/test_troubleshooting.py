@@ -75,6 +75,25 @@ def test_each_text_of_a_solver_that_cannot_keep_up_has_an_entry() -> None:
     assert all(word in whole for word in re.findall(r"one in \w+", f"{NO_TIME} {ONE_IN_FIVE}"))
 
 
+def problems() -> set[str]:
+    """Return what tracks and networks say is wrong: the texts with values in them, {} in each one's place."""
+    found = set()
+    for folder in ("track", "network"):
+        for path in sorted((REPOSITORY / "solver_service" / folder).glob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.JoinedStr):
+                    parts = [str(part.value) if isinstance(part, ast.Constant) else "{}" for part in node.values]
+                    found.add("".join(parts))
+    # The rest names nodes, or is a part of one of these.
+    return {text for text in found if len(text.split()) > 3 and ("{}:" in text or "contradict" in text)}
+
+
+def test_each_problem_of_a_track_or_a_network_has_an_entry() -> None:
+    texts = problems()
+    assert len(texts) > 14
+    assert [text for text in texts if not any(entry in text for entry in entries())] == []
+
+
 @pytest.mark.parametrize("word", ["range_gap", "compass", "sights"])
 def test_a_missing_entry_would_be_found(word: str, tmp_path: Path) -> None:
     shorter = tmp_path / "page.md"

@@ -37,6 +37,8 @@ log = logging.getLogger(__name__)
 TOGETHER: Final = 2048
 # Half a trigger period at 10 Hz. An offset with a larger sd (1 sd) does not tell which pictures were taken together.
 CLOCK_KNOWN_S: Final = 0.05
+# A track whose rows are further apart is told in parts.
+PART_S: Final = 1.0
 # The inputs that the output has beside the poses, so that it can be evaluated and solved again without other logs.
 COPIED = ("info", "candidates", "imu", "attitude", "depth", "mark", "truth", "light_truth", "net_truth")
 
@@ -221,19 +223,25 @@ def solved(core: SolverCore, messages: Iterable[Message]) -> Iterator[Message]:
 
 @dataclass
 class Tracked:
-    """What was written of one pair's track. rows: how often it tells; span_s: from its first to its last time.
-
-    longest_gap_s: the longest time without a light that it tells through.
+    """What was written of one pair's track. rows: how often it tells; parts: stretches of rows less than PART_S apart;
+    apart_ns: the time between them. longest_gap_s: the longest time without a light.
     """
 
     rows: int = 0
+    parts: int = 0
     first_ns: int = 0
     last_ns: int = 0
+    apart_ns: int = 0
     longest_gap_s: float = 0.0
 
     def take(self, track: Track | NodePose) -> None:
         """Count a row."""
         self.first_ns = self.first_ns if self.rows else track.stamp_ns
+        step_ns = track.stamp_ns - self.last_ns if self.rows else 0
+        if not self.rows or step_ns > PART_S * S_NS:
+            self.parts += 1
+            self.apart_ns += step_ns
+            self.longest_gap_s = max(self.longest_gap_s, step_ns / S_NS)
         self.last_ns = max(self.last_ns, track.stamp_ns)
         self.rows += 1
         self.longest_gap_s = max(self.longest_gap_s, track.age_s)
@@ -242,6 +250,12 @@ class Tracked:
     def span_s(self) -> float:
         """From the first to the last row."""
         return (self.last_ns - self.first_ns) / S_NS
+
+    def __str__(self) -> str:
+        """Say for how long it tells."""
+        told_s = self.span_s - self.apart_ns / S_NS
+        of = f" of {self.span_s:.1f} s, in {self.parts} parts" if self.parts > 1 else " s"
+        return f"{self.rows} rows over {told_s:.1f}{of}, longest time without a light {self.longest_gap_s:.1f} s"
 
 
 def _write(writer: DiveLogWriter, results: Iterable[Message], tracks: dict[tuple[str, ...], Tracked]) -> None:
@@ -304,7 +318,7 @@ def _summarize(
         if pair.tracker is not None:
             print(_track_text(args.track, pair, tracks))
     for (net, node), of in told.items():
-        print(f"  node {node} in the net {net}: {of.rows} rows, longest time without a light {of.longest_gap_s:.1f} s")
+        print(f"  node {node} in the net {net}: {of}")
     if bad:
         print(f"  {bad:6d} messages that could not be used")
     print(f"  {took_s:.1f} s, {core.counts.total() / max(took_s, 1e-9):.0f} triggers/s")
@@ -345,10 +359,7 @@ def _track_text(mode: str, pair: PairCore, tracks: Mapping[tuple[str, ...], Trac
         return f"  no track ({mode}): it starts from a pose, or from lights and both attitudes"
     clock = pair.tracker.clock_now()
     clocks = "" if clock is None else f"; {_clock_words(pair.nodes, *clock)}"
-    return (
-        f"  track ({mode}): {told.rows} rows over {told.span_s:.1f} s, "
-        f"longest time without a light {told.longest_gap_s:.1f} s{clocks}"
-    )
+    return f"  track ({mode}): {told}{clocks}"
 
 
 def _clock_words(nodes: tuple[str, str], offset_s: float, sigma_s: float) -> str:

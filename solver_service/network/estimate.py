@@ -193,7 +193,9 @@ class NetEstimate(NetBelief):
         """Whether a picture of a member may tell of another's lights."""
         member = self.members[other]
         skip_s = max(member.skip_s, self.members[observer].skip_s if not member.confirmed else -np.inf)
-        return other != observer and member.node not in self.dark and sight.t_s >= skip_s
+        if other == observer or member.node in self.dark or sight.t_s < skip_s:
+            return False
+        return member.node in self.places or not self.intake.gone(member.node, sight.t_s)
 
     def _lit(self, node: int, sight: Sight) -> tuple[bool, bool]:
         """Return which of a node's lamps are lit in a picture."""

@@ -170,6 +170,7 @@ class NetFilter(TrackIntake):
         trial._rejected = self._rejected.copy()
         trial._events = sorted(event for event in self._events if event[1] != ROW)
         trial._go_on(self._events[0][0] + REHEARSED_S)
+        self._pictured_s.clear()
         return trial.main
 
     def _ask(self, t_s: float, stamp_ns: int) -> list[NetRow]:
@@ -212,6 +213,8 @@ class NetFilter(TrackIntake):
     def _take_sights(self, t_s: float, sights: Sequence[Sight]) -> None:
         self._check_units(t_s)
         self._check_fixed(t_s)
+        for sight in sights:
+            self._hear(sight.node, t_s)
         if self.main.state is None and self.main.places:
             self.main.begin(t_s)
         for estimate in [self.main, *self.challengers]:

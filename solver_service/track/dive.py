@@ -25,6 +25,7 @@ from buddyline.solver_service.track.parts import (
     goes_on,
     in_pieces,
     lasted_s,
+    mostly_without,
     of_one_clock,
     parts_of,
 )
@@ -37,6 +38,7 @@ from buddyline.solver_service.track.records import (
     parted,
     pass_over,
     stamp_of,
+    until_one_ended,
 )
 from buddyline.solver_service.track.relax import PassedOver, PathPass, clock_sigma_s, settled
 from buddyline.solver_service.track.smoother import Path, rows_between, smoothed
@@ -85,7 +87,8 @@ def smooth(
     clock_ns: how far B's clock is believed ahead. again: whether to begin once more where the later passes contradict
     the first one: with the offset that they found, which is nearer than that of the first.
     """
-    records, fixes = (parted(in_order(records[0])), parted(in_order(records[1]))), sorted(fixes, key=stamp_of)
+    a, b = until_one_ended((in_order(records[0]), in_order(records[1])), clock_ns)
+    records, fixes = (parted(a), parted(b)), sorted(fixes, key=stamp_of)
     told_ns = clock_ns
     long = bool(fixes) and fixes[-1].stamp_ns - fixes[0].stamp_ns > 2 * HEAD_NS
     head_ns = (fixes[0].stamp_ns + HEAD_NS) // PIECE_NS * PIECE_NS if long else END_NS
@@ -100,7 +103,7 @@ def smooth(
     if not parts:
         return Smoothed([], clock_ns * 1e-9, math.inf, first.problems)
     parts = of_one_clock(parts)
-    without = any(any(part.without) for part in parts)
+    without = any(map(mostly_without, parts))
     off_s = (clock_ns - told_ns) * 1e-9
     far = in_pieces(parts) or clock_off_by(parts[-1], MOST_LEFT_S)
     if far or (without and abs(off_s) > FAR_WITHOUT_S):
@@ -148,7 +151,8 @@ def smooth(
             span = f"no track for {lasted_s(part):.0f} s"
             lost.append(f"{first.both}: passes over the dive contradict the first one or do not settle: {span}")
     if not found and again and contradicting_ns is not None:
-        return smooth(records, fixes, outputs_ns, contradicting_ns, again=False)
+        other = smooth(records, fixes, outputs_ns, contradicting_ns, again=False)
+        return other if math.isfinite(other.clock_sigma_s) else replace(other, problems=[*other.problems, *lost])
     if not found:
         return Smoothed([], clock_ns * 1e-9, math.inf, [*first.problems, *lost])
     whole = _rows_of(found, outputs_ns)

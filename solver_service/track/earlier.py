@@ -23,7 +23,7 @@ class EarlierFilter(TrackFilter):
     def path_before(self, path: Path, since_s: float) -> Path | None:
         """Give the path from since_s to the start of another, with a look of no light at each picture.
 
-        None where a node has no inertial unit then.
+        None where a node has no inertial unit then, or was gone.
         """
         start_s, state = float(path.t_s[0]), path.state(0)
         at_start = Estimate(start_s, state, np.zeros((0, 0)), start_s)
@@ -38,8 +38,8 @@ class EarlierFilter(TrackFilter):
                 # Which light is which is decided by the next pass.
                 estimate.given[what.node, what.stamp_ns] = ()
                 self._step(estimate, t_s, what)
-        if any(estimate.without):
-            return None
+                if any(estimate.without):
+                    return None
         F, Q, walk = self._move(estimate, start_s)
         rates_radps = path.rates_radps[min(1, len(path) - 1)]
         last = Step(start_s, estimate.state.to_row(), path.states[0], path.oldest, F, Q, walk, rates_radps, since_s, 0)

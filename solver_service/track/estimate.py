@@ -34,19 +34,20 @@ class Estimate:
     The lights: detection (2, 2): by observer and light, how likely a light in the picture is found. last_seen (2,):
     the probability that each light is among the last picture's candidates, None where not both should be in it.
     light_s: when a light was last used, at first its start, which is made of lights; trigger: time, observer and light
-    of those of the last trigger. bars: how many pictures showed both lights, bar_s: when one last did; told_by: how
-    many of each node showed any. missed: in how many of each node's last pictures, on end, a light should be and none
-    was used. unseen_by: a node that has shown no light yet.
+    of those of the last trigger. pictures: how many it has taken since it is confirmed; bare: of these, how many while
+    a node had no inertial unit. bars: how many pictures showed both lights, bar_s: when one last did; told_by: how many
+    of each node showed any. missed: in how many of each node's last pictures, on end, a light should be and none was
+    used. unseen_by: a node that has shown no light yet.
 
     How well it fits: evidence: log odds over clutter; evidence_by: of each node's pictures. baseline: the main
     estimate's at the start. surprise, told: chi^2 of the lights used, and of how many residuals. agreed_s: when a fix
     last agreed with it, inf where none did; agreed: how many did; contradicted: how many since then did not.
 
-    Its life: searched: it started without a fix; lone: from single lamps.
-    skip_s: pictures within this after start_s made it, and tell nothing
-    new. patience_s: how long it may stay unconfirmed. end_s: later pictures are not its own. course: the evidence over
-    time, used: the lights of each picture, by node and stamp; both while it is not confirmed. given: the lights to use
-    where that is decided. saw: node of the lamps, time and last_seen of each picture while it is not confirmed.
+    Its life: searched: it started without a fix; lone: from single lamps. skip_s: pictures within this after start_s
+    made it, and tell nothing new. patience_s: how long it may stay unconfirmed. end_s: later pictures are not its own.
+    course: the evidence over time, used: the lights of each picture, by node and stamp; both while it is not confirmed.
+    given: the lights to use where that is decided. saw: node of the lamps, time and last_seen of each picture while it
+    is not confirmed.
     """
 
     t_s: float
@@ -78,6 +79,8 @@ class Estimate:
     unseen_by: int | None = None
     searched: bool = False
     lone: bool = False
+    pictures: int = 0
+    bare: int = 0
     bars: int = 0
     bar_s: float = -np.inf
     told_by: list[int] = field(default_factory=lambda: [0, 0])
@@ -106,7 +109,8 @@ class Estimate:
 
     def copied(self, **changes: object) -> Estimate:
         """Give an estimate that goes its own way from here."""
-        lists = ("evidence_by", "trigger", "attitude_s", "told_by", "missed", "without", "turning_off", "course", "saw")
+        of_nodes = "evidence_by", "attitude_s", "told_by", "missed", "without", "turning_off"
+        lists = *of_nodes, "trigger", "course", "saw"
         own: dict[str, object] = {name: list(getattr(self, name)) for name in lists}
         own |= {"detection": self.detection.copy(), "steps": self.steps.copy(), "used": dict(self.used)}
         return replace(self, **(own | changes))  # type: ignore[arg-type]

@@ -183,6 +183,10 @@ class TrackFilter(TrackPool):
 
     def _take_sight(self, t_s: float, sight: Sight) -> None:
         self._check_units(t_s)
+        self._hear(sight.node, t_s)
+        if self.gone(1 - sight.node, t_s):
+            self._go_on_alone(t_s, 1 - sight.node)
+            return
         self._remember(t_s, sight)
         for estimate in self._estimates():
             if t_s >= estimate.t_s and t_s > estimate.start_s + estimate.skip_s:
@@ -192,11 +196,21 @@ class TrackFilter(TrackPool):
                     self._follow(estimate, t_s, sight)
                     continue
                 self._step(estimate, t_s, sight)
+                estimate.pictures += 1
+                estimate.bare += any(estimate.without)
                 if estimate is self.main and estimate.last_seen is not None:
                     self.lamps.take(1 - sight.node, t_s, estimate.last_seen)
         self._judge(t_s)
         self._search(t_s, sight)
         self._search_window(t_s)
+
+    def _go_on_alone(self, t_s: float, gone: int) -> None:
+        """Go on to a picture of a node that is gone, which tells nothing."""
+        if self.main is not None and self.main.confirmed:
+            self._step(self.main, t_s, None)
+        self._judge(t_s)
+        if self.main is not None and self.main.confirmed:
+            self._problems.report(f"node {self.nodes[gone].name}: told nothing: its lamps alone show no track", t_s)
 
     def _take_fix(self, t_s: float, fix: FixSeen) -> None:
         self._fix_s = t_s

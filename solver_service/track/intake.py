@@ -21,6 +21,10 @@ from buddyline.solver_service.track.units import clipped, fault_of
 CHECK_EVERY_S: Final = 2.0
 REJECTED_TO_SAY: Final = 10
 SILENT_S: Final = 1.0
+# A node that has told nothing for so long, and for GONE_PICTURES of its own, is gone. Nothing says how it turns then:
+# its lamps alone look the same whether it turns to the left or to the right.
+GONE_S: Final = 0.5
+GONE_PICTURES: Final = 3
 LEAST_SIGMA_RAD: Final = 1e-3
 # Taken for roll, pitch and yaw where a message states a sigma below LEAST_SIGMA_RAD, which no attitude filter reaches.
 UNTOLD_SIGMA_RAD: Final = np.radians((1.5, 1.5, 6.0))
@@ -51,6 +55,8 @@ class TrackIntake:
         self._count = 0
         self._checked_s = -np.inf
         self._rejected = [0 for _ in nodes]
+        # Of each node that has a picture, when its last one was, and how long after the one before.
+        self._pictured_s: dict[int, tuple[float, float]] = {}
 
     def seconds(self, node: int, stamp_ns: int) -> float:
         """Give a stamp of a node as s since the epoch, on A's clock as first believed."""
@@ -151,7 +157,7 @@ class TrackIntake:
             samples.trusted = fault is None
             if fault is not None:
                 self._problems.report(fault, t_s)
-            elif len(samples) and not len(samples.last(t_s + SILENT_S, 2.0 * SILENT_S)):
+            elif len(samples) and not (len(samples.last(t_s + SILENT_S, 2.0 * SILENT_S)) or self.gone(node, t_s)):
                 name = self.nodes[node].name
                 self._problems.report(f"node {name}: inertial samples are missing: the track does without them", t_s)
             if samples.rejected > self._rejected[node] + REJECTED_TO_SAY:
@@ -159,6 +165,19 @@ class TrackIntake:
                 said = f"node {name}: inertial samples not finite, clipped or sent twice are left out"
                 self._problems.report(said, t_s)
                 self._rejected[node] = samples.rejected
+
+    def _hear(self, node: int, t_s: float) -> None:
+        """Note a node's picture, which has its turn."""
+        before_s, _ = self._pictured_s.get(node, (t_s, 0.0))
+        self._pictured_s[node] = t_s, t_s - before_s
+
+    def gone(self, node: int, t_s: float) -> bool:
+        """Whether a node tells nothing: no pictures, samples or attitudes. What is told later changes nothing in it."""
+        pictured_s, apart_s = self._pictured_s.get(node, (-np.inf, 0.0))
+        if t_s - pictured_s <= max(GONE_S, GONE_PICTURES * apart_s):
+            return False
+        seen = newest_before(self.attitudes[node], t_s)
+        return (seen is None or t_s - seen[0] > GONE_S) and not len(self.samples[node].last(t_s, GONE_S))
 
     @property
     def both(self) -> str:

@@ -57,6 +57,11 @@ def lasted_s(part: Estimate) -> float:
     return min(part.t_s, part.end_s) - part.start_s
 
 
+def mostly_without(part: Estimate) -> bool:
+    """Whether one of a track's nodes has had no inertial unit in most of the pictures."""
+    return part.bare > 0.5 * part.pictures
+
+
 def in_pieces(parts: Sequence[Estimate]) -> bool:
     """Whether a dive's tracks disagree on the clocks' offset: it is further off than was tried."""
     return any(disagree(one, other, PIECES_S) for one, other in combinations(parts, 2))
@@ -90,7 +95,7 @@ def clock_left_ns(parts: Sequence[Estimate]) -> int:
     """Give by how much B's clock proves to be off what a pass assumed; 0 where that is near enough."""
     if not parts:
         return 0
-    without = any(any(part.without) for part in parts)
+    without = any(map(mostly_without, parts))
     off = clock_off_by(parts[-1], MOST_LEFT_S if without else NEAR_CLOCK_S)
     return round(parts[-1].state.clock_s * 1e9) if off else 0
 

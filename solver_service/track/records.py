@@ -93,6 +93,26 @@ def in_order(record: NodeRecord) -> NodeRecord:
     )
 
 
+def until_one_ended(records: Records, clock_ns: int) -> Records:
+    """Give what was recorded until the first of the two nodes ended: no two are switched off at once.
+
+    clock_ns: how far B's clock is ahead. What the other one saw after that would be a dive without inertial samples.
+    """
+    shifts_ns = 0, clock_ns
+    ends_ns = [_end_ns(record) - shift_ns for record, shift_ns in zip(records, shifts_ns, strict=True)]
+    a, b = (
+        record.between(BEGINNING_NS, min(ends_ns) + shift_ns + 1)
+        for record, shift_ns in zip(records, shifts_ns, strict=True)
+    )
+    return a, b
+
+
+def _end_ns(record: NodeRecord) -> int:
+    """Give the last stamp of a record in order."""
+    told = [items[-1].stamp_ns for items in (record.frames, record.attitudes, record.depths) if items]
+    return max([*told, *record.imu_stamps_ns[-1:].tolist()], default=END_NS)
+
+
 def parted(record: NodeRecord) -> NodeRecord:
     """Give a record with the fast part of its inertial samples, and its camera's sudden turns."""
     stamps_ns = record.imu_stamps_ns

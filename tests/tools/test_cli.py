@@ -14,10 +14,11 @@ from buddyline.protocol.divelog import DiveLogWriter
 from buddyline.solver_service.choices import METHODS
 from buddyline.solver_service.geometry.observation import Method
 from buddyline.tools.cli import COMMANDS, main
-from buddyline.tools.solve import _clock_words
+from buddyline.tools.solve import Tracked, _clock_words
 
 from tests.processes import buddyline
 from tests.solver_service.conftest import dive_messages
+from tests.tools.evaluated import track
 
 
 @pytest.fixture(scope="module")
@@ -73,10 +74,10 @@ def test_solve_and_its_summary(capsys, dive_log, tmp_path):
     summary = json.loads(out)
     assert summary["triggers"] == summary["solved"] + sum(summary["rejected"].values()) == 28
     assert summary["solved"] > 14
-    track = summary["track"]
-    assert track["rows"] > 100
-    assert track["span_s"] == pytest.approx((track["rows"] - 1) / 50.0)
-    assert (track["longest_gap_s"] < 1.0, track["problems"]) == (True, [])
+    figures = summary["track"]
+    assert figures["rows"] > 100
+    assert figures["span_s"] == pytest.approx((figures["rows"] - 1) / 50.0)
+    assert (figures["longest_gap_s"] < 1.0, figures["problems"]) == (True, [])
     status, out, _ = run(capsys, "evaluate", tmp_path / "out.mcap", "--json")
     assert status == 0
     json.loads(out)
@@ -87,6 +88,14 @@ def test_solve_says_what_its_track_covers(capsys, dive_log, tmp_path):
     assert re.search(r"track \(smooth\): \d+ rows over \d\.\d s, longest time without a light", out)
     _, out, _ = run(capsys, "solve", dive_log, "-o", tmp_path / "none.mcap", "--track", "none")
     assert "track (" not in out
+
+
+def test_a_track_in_parts_says_for_how_long_it_tells():
+    told = Tracked()
+    for k in (0, 1, 2, 1000, 1001):
+        told.take(track(k, (0.0, 0.0, 3.0)))
+    assert (told.rows, told.parts) == (5, 2)
+    assert re.match(r"5 rows over 0\.3 of 100\.1 s, in 2 parts, longest time without a light 99\.8 s", str(told))
 
 
 @pytest.mark.parametrize(

@@ -330,6 +330,19 @@ def test_networks_err_as_they_say(grade: str) -> None:
 
 
 @pytest.mark.slow
+def test_a_node_that_is_off_has_no_place_by_its_lamps_alone() -> None:
+    """Whether it turns to the left or to the right meanwhile, the others see the same."""
+    world, messages = dive(31, 24.0)
+    off_ns, on_ns = START_NS + 8 * S_NS, START_NS + 18 * S_NS
+    heard = [one for one in messages if getattr(one, "node", "") != "b" or not off_ns <= one.stamp_ns < on_ns]
+    for mode in ("filter", "smooth"):
+        found = errors(world, solved(heard, mode=mode)[0])
+        assert 120 < len(found["b"]) < 200
+        assert found["b"][:, 2].mean() < 2.0
+        assert len(found["c"]) > 200
+
+
+@pytest.mark.slow
 def test_a_fixed_node_that_moves_is_named() -> None:
     """Node c, which moves, is said to be fixed where it was at the start."""
     world, messages = dive(7, 8.0, more_nodes=("c",))

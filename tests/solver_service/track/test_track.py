@@ -16,7 +16,7 @@ from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.lag import TrackLag
 from buddyline.solver_service.track.output import TrackRow
-from buddyline.solver_service.track.records import NodeRecord, last_ns
+from buddyline.solver_service.track.records import NodeRecord, joined, last_ns
 from buddyline.solver_service.track.smoother import Path, smoothed
 from buddyline.solver_service.track.trail import Trail
 
@@ -48,6 +48,42 @@ def test_whole_dive_beats_its_fixes_and_is_honest(poor: bool) -> None:
     assert np.median(judged.errors_m) < 0.45 * np.median(fixes)
     assert np.percentile(judged.errors_m, 95) < 0.35 * np.percentile(fixes, 95)
     assert 0.4 < judged.nees < 2.0
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_node_that_is_switched_off_before_the_other_costs_only_what_comes_after(dive: KnownDive, first: int) -> None:
+    end_ns = dive.stamps_ns[-1] - 4_000_000_000
+    cut = [record.between(0, end_ns) for record in dive.records]
+    fixes, stamps_ns = (
+        [fix for fix in dive.fixes if fix.stamp_ns < end_ns],
+        [ns for ns in dive.stamps_ns if ns < end_ns],
+    )
+    one_cut = [record if k == 1 - first else cut[k] for k, record in enumerate(dive.records)]
+    found, wanted = (smooth((a, b), fixes, stamps_ns) for a, b in (one_cut, cut))
+    assert found.problems == []
+    assert found.clock_sigma_s == pytest.approx(wanted.clock_sigma_s, rel=1e-3)
+    [median_m, wanted_m] = (float(np.median(score(dive, one.rows).errors_m)) for one in (found, wanted))
+    assert median_m == pytest.approx(wanted_m, rel=1e-3)
+
+
+@pytest.mark.parametrize("node", [0, 1])
+def test_a_node_that_is_off_for_a_while_gives_no_track_by_its_lamps_alone(node: int) -> None:
+    """Whether it turns to the left or to the right meanwhile, the other one sees the same."""
+    dive = make(21 + node, replace(SHORT, seconds=32.0))
+    off_ns, on_ns = (EPOCH_NS + seconds * 1_000_000_000 for seconds in (11, 21))
+    known = dive.records[node]
+    known = joined([known.between(0, off_ns), known.between(on_ns, 2**62)])
+    a, b = (known if k == node else record for k, record in enumerate(dive.records))
+    fixes = [fix for fix in dive.fixes if not off_ns <= fix.stamp_ns < on_ns]
+    live = filter_of((a, b), fixes)
+    found = smooth((a, b), fixes, dive.stamps_ns)
+    assert np.isfinite(found.clock_sigma_s)
+    for rows in (live.advance(last_ns((a, b)), dive.stamps_ns), found.rows):
+        judged = score(dive, rows)
+        assert judged.wrong == 0
+        assert 0.4 < judged.nees < 2.0
+        assert judged.rows > 350
+    assert any("told nothing" in said for said in live.problems)
 
 
 def test_filter_covers_the_dive(dive: KnownDive) -> None:
