@@ -151,6 +151,17 @@ def test_a_point_without_fixes_is_reported(messages):
     assert "wreck" in found.problems[0].text
 
 
+def test_a_station_mark_that_names_nothing_is_said_beside_a_point_too(messages):
+    early_ns = world.START_NS - 10**12
+    marks = [
+        Mark(node="b", stamp_ns=early_ns, kind=kind, name=name)
+        for kind, name in (("point", "wreck"), ("station", "T4"))
+    ]
+    texts = [problem.text for problem in derived([*messages, *marks]).problems]
+    assert any(text.startswith("point wreck") for text in texts)
+    assert any(text.startswith("mark T4") and "no rest near it" in text for text in texts)
+
+
 def test_moving_round_a_fixed_node_keeps_its_station():
     rng = np.random.default_rng(4)
     places = np.array([[0.0, 0, 10], [5, 1, 9.0], [4, -3, 11.0], [6, 2, 10.2]])

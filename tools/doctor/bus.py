@@ -74,7 +74,8 @@ def check_bus(seen: Seen, endpoint: str, own: str | None) -> list[Finding]:
         if seen.no_hub:
             advice = "start it: buddyline hub; a node records without it"
             return [Finding("hub", "warning", seen.error, advice), nodes]
-        return [Finding("hub", "problem", seen.error, "see docs/security.md; `buddyline keys` makes the files"), nodes]
+        advice = "name its files with --config keys/viewer.toml; `buddyline keys` makes them: docs/security.md"
+        return [Finding("hub", "problem", seen.error, advice), nodes]
     findings = [Finding("hub", "ok", f"answers at {endpoint}")]
     present = sorted(name.removeprefix("node/") for name in seen.alive if name.startswith("node/"))
     for node in present:

@@ -24,7 +24,7 @@ REASONS: Final[dict[str, tuple[str, str]]] = {
     ),
     "range_gap": (
         "the two distances disagree",
-        "check that the lights' spacing in the configuration is what was built",
+        "one light was another's or half hidden; if it stays, check the lights' spacing in the configuration",
     ),
     "twist_gap": ("the two views disagree on the twist", "check the mounting of lights and camera"),
     "attitude": (

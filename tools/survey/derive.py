@@ -88,7 +88,17 @@ class Derived:
         for leg in self.legs:
             for name in {leg.from_, leg.to} - marked:
                 self.numbered.setdefault(name, leg.dive)
-        points = [mark for mark in marks if mark.kind == "point" and mark.node in nodes]
+        for mark in marks:
+            if mark.kind == "point" and mark.node in nodes:
+                name = mark.name or f"p{len(self.points) + 1}"
+                # Of several nodes that saw the point, the first with enough fixes.
+                found = [chain.point(mark, name) for chain in chains if mark.node in chain.readings.nodes]
+                shot = next((one for one in found if isinstance(one, Leg)), None)
+                if shot is not None:
+                    self.points.append(shot)
+                else:
+                    self.add_problem(f"point {name}: {found[0]}")
+        from_marks = {leg.from_ for leg in (*passed, *self.points)}
         for mark in marks:
             at = time_text(mark.stamp_ns)
             if mark.node not in nodes and mark.kind != "note":
@@ -106,19 +116,9 @@ class Derived:
                 if mark.note and mark.note not in self.notes[mark.name]:
                     self.notes[mark.name].append(mark.note)
                 why = passing.get(id(mark), [])
-                used = points or any(isinstance(one, Leg) for one in why) or mark.name in {leg.from_ for leg in passed}
-                if why and not used:
+                if why and mark.name not in from_marks and not any(isinstance(one, Leg) for one in why):
                     self.faults += 1
                     self.add_problem(f"mark {mark.name} at {at}: no rest near it; in passing: {why[0]}")
-        for mark in points:
-            name = mark.name or f"p{len(self.points) + 1}"
-            # Of several nodes that saw the point, the first with enough fixes.
-            found = [chain.point(mark, name) for chain in chains if mark.node in chain.readings.nodes]
-            shot = next((one for one in found if isinstance(one, Leg)), None)
-            if shot is not None:
-                self.points.append(shot)
-            else:
-                self.add_problem(f"point {name}: {found[0]}")
 
     def add_problem(self, text: str) -> None:
         """Add a problem."""
