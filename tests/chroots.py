@@ -3,11 +3,12 @@
     .venv/bin/python -m tests.chroots trixie                 # packages, clone, `make demo` to its first pose
     .venv/bin/python -m tests.chroots trixie --tests         # and `make test`
     .venv/bin/python -m tests.chroots trixie --setup-pi      # and `setup pi`, twice, with a stand-in for picamera2
-    .venv/bin/python -m tests.chroots trixie --arch arm64    # emulated by qemu-user, under proot
+    .venv/bin/python -m tests.chroots trixie --arch arm64    # emulated by qemu-user
 
 Each system is made by debootstrap in a folder for temporary files and kept; the clone in it is made anew, of what is
 committed. Each line says the seconds since the beginning, and the processor's seconds: those do not depend on what else
-the machine does. Needs root, debootstrap and Debian's packages; for arm64 also qemu-user-static and proot.
+the machine does. Needs root, debootstrap and Debian's packages; for arm64 also qemu-user-static, with which the kernel
+is told to run programs of that processor until this ends, where it was not before.
 """
 
 from __future__ import annotations
@@ -21,10 +22,15 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from tests.processes import REPOSITORY
 
+BINFMT = Path("/proc/sys/fs/binfmt_misc")
+# How Debian's qemu-user-static has programs of the other processor run; systemd reads it where there is one.
+EMULATION = Path("/usr/lib/binfmt.d/qemu-aarch64.conf")
 CHROOTS = Path(tempfile.gettempdir()) / "buddyline-chroots"
 CERTIFICATES = "etc/ssl/certs/ca-certificates.crt"
 # README.md's line, and node/README.md's.
@@ -50,7 +56,7 @@ class Debian:
     """A Debian system in a folder."""
 
     def __init__(self, suite: str, arch: str) -> None:
-        self.root, self._emulated = CHROOTS / f"{suite}-{arch}", arch == "arm64"
+        self.root = CHROOTS / f"{suite}-{arch}"
         if not (self.root / "made").exists():
             shutil.rmtree(self.root, ignore_errors=True)
             self._make(suite, arch)
@@ -60,11 +66,8 @@ class Debian:
     def _make(self, suite: str, arch: str) -> None:
         print(f"debootstrap {suite} {arch} in {self.root}", flush=True)
         self.root.mkdir(parents=True)
-        foreign = ["--foreign"] if self._emulated else []
-        words = ["debootstrap", *foreign, f"--arch={arch}", "--variant=minbase", "--include=ca-certificates"]
+        words = ["debootstrap", f"--arch={arch}", "--variant=minbase", "--include=ca-certificates"]
         subprocess.run([*words, suite, str(self.root)], check=True, stdout=subprocess.DEVNULL)
-        if self._emulated:
-            self.run("DEBOOTSTRAP_DIR=/debootstrap /debootstrap/debootstrap --second-stage")
         (self.root / "made").touch()
 
     def run(self, script: str, user: str = "root", wanted: tuple[int, ...] = (0,), awaited: str = "") -> str:
@@ -77,11 +80,7 @@ class Debian:
         as_user = [] if user == "root" else ["runuser", "-u", user, "--"]
         words = ["/usr/bin/env", "-i", *(f"{name}={value}" for name, value in variables.items()), *as_user]
         words += ["/bin/sh", "-ec", script]
-        if self._emulated:
-            binds = [word for folder in ("/proc", "/dev", "/sys") for word in ("-b", folder)]
-            entered = ["proot", "-q", "qemu-aarch64-static", "-0", "-r", str(self.root), *binds, "-w", "/", *words]
-        else:
-            entered = ["unshare", "--mount", "sh", "-ec", MOUNTED, "sh", str(self.root), *words]
+        entered = ["unshare", "--mount", "sh", "-ec", MOUNTED, "sh", str(self.root), *words]
         child = subprocess.Popen(entered, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
         assert child.stdout is not None
         lines = []
@@ -105,6 +104,23 @@ class Debian:
 def _cpu_s() -> float:
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
+
+
+@contextmanager
+def emulated(arch: str) -> Iterator[None]:
+    """Have the kernel run programs of another processor by qemu, as long as this lasts."""
+    entry = BINFMT / "qemu-aarch64"
+    if arch != "arm64" or entry.exists():
+        yield
+        return
+    if not (BINFMT / "register").exists():
+        subprocess.run(["mount", "-t", "binfmt_misc", "binfmt_misc", str(BINFMT)], check=True)
+    if not entry.exists():
+        (BINFMT / "register").write_text(EMULATION.read_text().strip())
+    try:
+        yield
+    finally:
+        entry.write_text("-1")
 
 
 def first_pose(system: Debian) -> None:
@@ -199,13 +215,14 @@ def main() -> int:
     args = parser.parse_args()
     if os.geteuid() != 0:
         parser.error("needs root")
-    system = Debian(args.suite, args.arch)
     try:
-        first_pose(system)
-        if args.tests:
-            tests(system)
-        if args.setup_pi:
-            setup_pi(system)
+        with emulated(args.arch):
+            system = Debian(args.suite, args.arch)
+            first_pose(system)
+            if args.tests:
+                tests(system)
+            if args.setup_pi:
+                setup_pi(system)
     except (FailedError, AssertionError) as error:
         print(error, file=sys.stderr)
         return 1
