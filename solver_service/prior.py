@@ -61,7 +61,7 @@ class PosePrior:
         if self._stamp_ns is None or not 0 <= stamp_ns - self._stamp_ns <= LIFETIME_NS:
             return None
         T_a_b, P = self._predicted(self._stamp_ns, stamp_ns)
-        return Prior(T_a_b, P[:6, :6], self._rates, P[6:, 6:], self._agreed)
+        return Prior(T_a_b, P[:6, :6], self._rates, P[6:, 6:], self._agreed, (stamp_ns - self._stamp_ns) / S_NS)
 
     def update(self, stamp_ns: int, fix: Fix) -> None:
         """Update the filter with a fix; restart it with the fix if that is outside the gate."""

@@ -110,7 +110,7 @@ class Prior:
     """A prediction from earlier fixes for this instant, its covariance (6, 6) widened for the time since.
 
     rates: (6,) velocity (m/s) and turn (rad/s) of B in A's camera frame, with covariance (6, 6); None: unknown.
-    agreed: how many fixes in a row have agreed with those before.
+    agreed: how many fixes in a row have agreed with those before. since_s: time since the last of them.
     """
 
     T_a_b: SE3
@@ -118,6 +118,7 @@ class Prior:
     rates: Floats | None = None
     rates_covariance: Floats | None = None
     agreed: int = 0
+    since_s: float = 0.0
 
 
 @dataclass(frozen=True)

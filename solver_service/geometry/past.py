@@ -24,9 +24,10 @@ _LEAST_KNOWN: Final = 1e-6 * np.eye(6)
 # gain as much as the right one.
 _PRIOR_WRONG: Final = 0.15
 _MAX_LOG_PRIOR: Final = 7.0
-# chi^2 of six degrees of freedom. No diver moves so far from a prediction (20 sigma): there the pose is wrong, or all
-# earlier fixes are, and each that agreed with those before makes that less likely by _PRIOR_WRONG, up to so many.
-_OUT_OF_REACH: Final = 400.0
+# Divers swim and turn no faster than this: a pose further from the prediction is wrong, or all earlier fixes are, and
+# each that agreed with those before makes that less likely by _PRIOR_WRONG, up to so many.
+_REACH_MPS: Final = 2.0
+_REACH_RADPS: Final = 3.0
 _MOST_AGREED: Final = 5
 # A matrix (9,) times this: half its antisymmetric part as a vector, and its trace.
 _SINES_AND_TRACE: Final = np.column_stack((0.5 * skew(np.eye(3)).reshape(3, 9).T, np.eye(3).ravel()))
@@ -56,13 +57,14 @@ class Motion:
 class Prediction:
     """Where earlier fixes put this one: T_a_b, and the information (6, 6) of a pose against it.
 
-    log_gain: of a pose that is exactly there, against chance, at most _MAX_LOG_PRIOR. all_wrong: how likely all of the
-    earlier fixes are wrong.
+    log_gain: of a pose that is exactly there, against chance, at most _MAX_LOG_PRIOR. reach_m: how far the nodes may
+    have moved otherwise. all_wrong: how likely all of the earlier fixes are wrong.
     """
 
     T_a_b: SE3
     information: Floats
     log_gain: float
+    reach_m: float
     all_wrong: float
 
     @staticmethod
@@ -81,8 +83,11 @@ class Prediction:
         log_chance = -math.log(range2**1.5 * spread * rigs.views_sr2 * 2.0 * math.pi)
         log_area = 0.5 * float(np.linalg.slogdet(total)[1]) + 3.0 * math.log(2.0 * math.pi)
         information: Floats = np.asarray(np.linalg.inv(total), dtype=np.float64)
+        log_gain = min(-log_area - log_chance, _MAX_LOG_PRIOR)
+        sigma_m = math.sqrt(float(np.trace(total[:3, :3])))
+        reach_m = (_REACH_MPS + _REACH_RADPS * math.sqrt(range2)) * prior.since_s + 4.0 * sigma_m
         all_wrong = _PRIOR_WRONG ** (1 + min(prior.agreed, _MOST_AGREED))
-        return Prediction(prior.T_a_b, information, min(-log_area - log_chance, _MAX_LOG_PRIOR), all_wrong)
+        return Prediction(prior.T_a_b, information, log_gain, reach_m, all_wrong)
 
     def weigh(self, T_a_b: SE3, *, three: bool) -> Floats:
         """Weigh K poses between the cameras' frames: give a bounded gain and a bounded loss (log), (K,).
@@ -94,7 +99,8 @@ class Prediction:
         turned = (T_a_b.R @ self.T_a_b.R.T).reshape(-1, 9) @ _SINES_AND_TRACE
         off = np.concatenate((T_a_b.t_m - self.T_a_b.t_m, turned[:, :3]), axis=1)
         chi2 = np.where(turned[:, 3] > 1.0, inner(off @ self.information, off), np.inf)
-        wrong = np.where((chi2 < _OUT_OF_REACH) | three, _PRIOR_WRONG, self.all_wrong)
+        in_reach = inner(off[:, :3], off[:, :3]) < self.reach_m**2
+        wrong = np.where(in_reach | three, _PRIOR_WRONG, self.all_wrong)
         gain: Floats = np.log(wrong + (1.0 - _PRIOR_WRONG) * np.exp(self.log_gain - 0.5 * chi2))
         return gain
 
