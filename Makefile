@@ -21,8 +21,9 @@ ON_PATH = $(call LINKS,.venv/names) && \
 
 .PHONY: demo test matrix coverage docs release install names clean
 
+# Ctrl-C, which ends it with 130, is no error.
 demo: .venv/.run
-	$(BIN)/buddyline demo $(ARGS)
+	@trap : INT; $(BIN)/buddyline demo $(ARGS) || [ $$? -eq 130 ]
 
 test: .venv/.test names
 	$(BIN)/ruff format --check .

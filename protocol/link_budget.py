@@ -164,7 +164,7 @@ class LinkBudget:
                 self._words = f"slow link{rate}: sent of {', '.join(parts)}; the log has all" if parts else ""
                 behind_s = now_s - self._clear_s
                 if self._seen and behind_s > BEHIND_S:
-                    late = f"messages wait for more than {BEHIND_S:g} s, for {behind_s:.0f} s now"
+                    late = f"messages come {BEHIND_S:g} s late or more, since {behind_s:.0f} s ago; the log has all"
                     self._words = f"{self._words}; {late}" if parts else f"slow link{rate}: {late}"
                 self._sent.clear()
                 self._left_out.clear()

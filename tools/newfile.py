@@ -79,7 +79,7 @@ def new_folder(path: Path | str) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
-            raise BuddylineError(f"{folder}: is not empty; name another folder")
+            raise BuddylineError(f"{folder}: is not empty; name another folder, or empty it")
     except OSError as error:
         raise BuddylineError(f"{folder}: cannot be made: {error.strerror}") from error
     return folder

@@ -18,7 +18,9 @@ def terminal_size() -> os.terminal_size:
         of_stderr = os.get_terminal_size(sys.stderr.fileno())
     except (OSError, ValueError):
         of_stderr = os.terminal_size((80, 24))
-    return shutil.get_terminal_size(of_stderr)
+    # A terminal that nobody has given a size says 0.
+    found = shutil.get_terminal_size(of_stderr)
+    return found if min(found) > 0 else os.terminal_size((80, 24))
 
 
 class Progress:

@@ -118,7 +118,7 @@ def test_copies_go_on_a_slow_link_that_is_not_behind() -> None:
     for step in range(20):
         budget.observe(TcpState(1000 * step, 4096, 0, 0, 0.4), 27.0 + step / 10)
     assert not budget.admits_copy(1000, 29.0)
-    assert "messages wait for more than 1 s, for 2 s now" in budget.words(29.0)
+    assert "messages come 1 s late or more, since 2 s ago" in budget.words(29.0)
 
 
 def test_copies_go_on_beside_a_connection_that_a_lost_packet_has_stopped() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import re
 import sys
 import threading
@@ -20,6 +21,7 @@ from buddyline.tools.demo import command
 from buddyline.tools.demo.command import _show
 from buddyline.tools.demo.dashboard import Dashboard, summary_text
 from buddyline.tools.draw.above import ASCII_ARROWS
+from buddyline.tools.progress import terminal_size
 from msgspec.structs import replace
 
 from tests.tools.evaluated import pose, rejection, track
@@ -107,6 +109,13 @@ def test_the_screen_fits_its_terminal(size):
     assert "last without a pose: " in text
     assert "deg  lights: a 2, b 2" in text
     assert ("latency" in text) == (size[1] > 24)
+
+
+def test_a_terminal_that_nobody_gave_a_size_counts_as_80_by_24(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)
+    monkeypatch.delenv("LINES", raising=False)
+    monkeypatch.setattr(os, "get_terminal_size", lambda *_: os.terminal_size((0, 0)))
+    assert terminal_size() == (80, 24)
 
 
 class Terminal(io.StringIO):

@@ -306,4 +306,7 @@ def _text(report: Mapping[str, Any], proposed: Values, before: Judged, after: Ju
     if report["masks"]:
         corners = [f"[[{u0:g}, {v0:g}], [{u1:g}, {v1:g}]]" for (u0, v0), (u1, v1) in report["masks"]]
         lines += [f"masks = [{', '.join(corners)}]  # what stays still; look at the marked pictures first"]
+    else:
+        lines += ["# masks: nothing stays still in these pictures"]
+    lines += ["", "These lines belong in the node's configuration (docs/node.md); `detect --mask` tries a mask."]
     return "\n".join(lines) + "\n"
