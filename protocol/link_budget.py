@@ -161,11 +161,11 @@ class LinkBudget:
                     for name, left_out in sorted(self._left_out.items())
                 ]
                 rate = "" if self._limit is None else f" of about {self._limit / 1000:.0f} kB/s"
-                self._words = f"slow link{rate}: sent of {', '.join(parts)}; the log has all" if parts else ""
+                told = [f"sent of {', '.join(parts)}"] if parts else []
                 behind_s = now_s - self._clear_s
                 if self._seen and behind_s > BEHIND_S:
-                    late = f"messages come {BEHIND_S:g} s late or more, since {behind_s:.0f} s ago; the log has all"
-                    self._words = f"{self._words}; {late}" if parts else f"slow link{rate}: {late}"
+                    told.append(f"messages come {BEHIND_S:g} s late or more, since {behind_s:.0f} s ago")
+                self._words = f"slow link{rate}: {'; '.join(told)}; the log has all" if told else ""
                 self._sent.clear()
                 self._left_out.clear()
                 self._counted_s = now_s

@@ -77,9 +77,6 @@ class NetErrors:
         return int(((np.sqrt(self.squared_m2) > WRONG_M) | (self.turned_rad > WRONG_RAD)).sum())
 
 
-_SQUARES = "squared_m2", "variance_m2"
-
-
 @dataclass
 class Pooled:
     """Squared errors and the bound's variances of one thing, by dive and node."""
@@ -113,7 +110,8 @@ class Figures:
     @property
     def over_all(self) -> str:
         """Say how far all rows are off together, and how many are wrong."""
-        squared, variance = (np.concatenate([getattr(one, name) for one in self.errors]) for name in _SQUARES)
+        squared = np.concatenate([one.squared_m2 for one in self.errors])
+        variance = np.concatenate([one.variance_m2 for one in self.errors])
         turned_deg = np.degrees(np.concatenate([one.turned_rad for one in self.errors]))
         rms_mm, sigma_mm = (1000.0 * math.sqrt(of.mean()) for of in (squared, variance))
         median_mm, most_mm = 1000.0 * np.sqrt(np.percentile(squared, (50.0, 95.0)))

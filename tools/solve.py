@@ -223,8 +223,10 @@ def solved(core: SolverCore, messages: Iterable[Message]) -> Iterator[Message]:
 
 @dataclass
 class Tracked:
-    """What was written of one pair's track. rows: how often it tells; parts: stretches of rows less than PART_S apart;
-    apart_ns: the time between them. longest_gap_s: the longest time without a light.
+    """What was written of one pair's track, or of one node's place in a net.
+
+    rows: how many. parts: how many stretches of rows that are less than PART_S apart; apart_ns: the time between these.
+    longest_gap_s: the longest time without a light.
     """
 
     rows: int = 0
@@ -252,7 +254,7 @@ class Tracked:
         return (self.last_ns - self.first_ns) / S_NS
 
     def __str__(self) -> str:
-        """Say for how long it tells."""
+        """Say how many rows there are, and over how long."""
         told_s = self.span_s - self.apart_ns / S_NS
         of = f" of {self.span_s:.1f} s, in {self.parts} parts" if self.parts > 1 else " s"
         return f"{self.rows} rows over {told_s:.1f}{of}, longest time without a light {self.longest_gap_s:.1f} s"

@@ -92,8 +92,8 @@ class Prediction:
     def weigh(self, T_a_b: SE3, *, three: bool) -> Floats:
         """Weigh K poses between the cameras' frames: give a bounded gain and a bounded loss (log), (K,).
 
-        three: whether they are of three lights. These keep what speaks for them out of reach: as rivals they show how
-        little such poses are to be trusted.
+        three: whether they are of three lights. Then all_wrong does not count: no gap checks such a pose, and rivals
+        out of reach show how far chance may go.
         """
         # Of the turn from there: the sine about each axis, and the trace; half a turn away the sine is short again.
         turned = (T_a_b.R @ self.T_a_b.R.T).reshape(-1, 9) @ _SINES_AND_TRACE

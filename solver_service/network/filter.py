@@ -170,6 +170,7 @@ class NetFilter(TrackIntake):
         trial._rejected = self._rejected.copy()
         trial._events = sorted(event for event in self._events if event[1] != ROW)
         trial._go_on(self._events[0][0] + REHEARSED_S)
+        # The trial has shared it, and its pictures come again.
         self._pictured_s.clear()
         return trial.main
 

@@ -205,7 +205,7 @@ class TrackFilter(TrackPool):
         self._search_window(t_s)
 
     def _go_on_alone(self, t_s: float, gone: int) -> None:
-        """Go on to a picture of a node that is gone, which tells nothing."""
+        """Go on to a picture that is not used, because the node that it may show is gone."""
         if self.main is not None and self.main.confirmed:
             self._step(self.main, t_s, None)
         self._judge(t_s)

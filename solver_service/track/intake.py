@@ -172,7 +172,7 @@ class TrackIntake:
         self._pictured_s[node] = t_s, t_s - before_s
 
     def gone(self, node: int, t_s: float) -> bool:
-        """Whether a node tells nothing: no pictures, samples or attitudes. What is told later changes nothing in it."""
+        """Whether a node tells no pictures, samples or attitudes at t_s. Nothing later than t_s is looked at."""
         pictured_s, apart_s = self._pictured_s.get(node, (-np.inf, 0.0))
         if t_s - pictured_s <= max(GONE_S, GONE_PICTURES * apart_s):
             return False

@@ -94,9 +94,9 @@ def in_order(record: NodeRecord) -> NodeRecord:
 
 
 def until_one_ended(records: Records, clock_ns: int) -> Records:
-    """Give what was recorded until the first of the two nodes ended: no two are switched off at once.
+    """Give what was recorded until the first of the two nodes ended: its lamps alone show no track after that.
 
-    clock_ns: how far B's clock is ahead. What the other one saw after that would be a dive without inertial samples.
+    clock_ns: how far B's clock is ahead.
     """
     shifts_ns = 0, clock_ns
     ends_ns = [_end_ns(record) - shift_ns for record, shift_ns in zip(records, shifts_ns, strict=True)]

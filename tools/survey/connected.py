@@ -75,8 +75,8 @@ def fixed_points(project: Project, grid: Grid) -> Fixed:
         fixed[fix.station] = np.array([*grid.position_m(fix), altitude_m]), sigmas_m
     if not fixed:
         if not project.leg:
-            why = "the dives gave none: see NO LEG in it" if project.dive else "run `buddyline survey legs` first"
-            raise BuddylineError(f"the project has no legs; {why}")
+            next_step = "its lines NO LEG say why" if project.dive else "run `buddyline survey legs` first"
+            raise BuddylineError(f"the project has no legs; {next_step}")
         start = _start_of(project)
         altitude_m = math.nan if start in by_depth else level_m - depths.get(start, 0.0)
         fixed[start] = np.array([0.0, 0.0, altitude_m]), np.zeros(3)
