@@ -21,6 +21,8 @@ from buddyline.solver_service.track.strapdown import (
     Noise,
     guessed_noise,
     noise_of_steps,
+    of_nodes,
+    of_pairs,
     propagate,
     sampled,
 )
@@ -100,24 +102,15 @@ def _enough(few: Sequence[Many], least: int) -> list[Many]:
 
 def _after(ways: Sequence[Way]) -> list[StateNow]:
     """Give where some ways end, as a filter's steps would bring it there."""
-    states = State.of_row(np.array([way.state.to_row() for way in ways]))
+    states = State(np.array([way.state.row for way in ways]))
     span_s = np.array([way.span_s for way in ways])
-    parts = _integrated(states, ways)
+    parts = of_pairs(integrated(of_nodes(states), [samples for way in ways for samples in way.samples]))
     after, F = propagate(states, parts, span_s, np.array([way.shares for way in ways]))
     densities = np.stack([sampled(way.noises) for way in ways], axis=1)
     shaking = np.array([way.shaking for way in ways])
     Q, walk, _ = noise_of_steps(after, parts, densities, shaking, span_s, _guessed(parts, ways))
     P = _block_after(np.array([way.covariance for way in ways]), F, Q, walk)
-    return list(map(StateNow, after.to_row(), P, parts.rate_radps))
-
-
-def _integrated(states: State, ways: Sequence[Way]) -> Increments:
-    """Give the increments of a batch of states, with its axis first."""
-    names = ("R", "gyro_bias_radps", "accel_bias_mps2", "mount_rad", "lever_m", "delay_s")
-    of_nodes = {name: (each := getattr(states, name)).reshape(-1, *each.shape[2:]) for name in names}
-    parts = integrated(replace(states, **of_nodes), [samples for way in ways for samples in way.samples])
-    told = {name: each.reshape(len(ways), 2, *each.shape[1:]) for name, each in vars(parts).items() if each is not None}
-    return replace(parts, **told)
+    return list(map(StateNow, after.row, P, parts.rate_radps))
 
 
 def _guessed(parts: Increments, ways: Sequence[Way]) -> Floats | None:
@@ -184,7 +177,7 @@ def make_rows(due: Iterable[DueRow]) -> None:
         now = [one.forecast.now for one in every]
         rows = rows_of(
             [one.stamp_ns for one in some],
-            State.of_row(np.array([each.row for each in now])),
+            State(np.array([each.row for each in now])),
             np.array([each.covariance for each in now]),
             np.array([one.rates_radps for one in every]),
             np.array([one.lights for one in every]),
@@ -196,4 +189,4 @@ def make_rows(due: Iterable[DueRow]) -> None:
 
 def of_state(t_s: float, state: State, P: Floats, rates_radps: Floats) -> Forecast:
     """Give a forecast of the present: nothing leads further. P (SIZE, SIZE)."""
-    return Forecast(t_s, StateNow(state.to_row(), P[BLOCK], rates_radps))
+    return Forecast(t_s, StateNow(state.row, P[BLOCK], rates_radps))

@@ -82,7 +82,7 @@ def _foreseen(
     camera: Camera, lights_m: Floats, observer: int, lit: Sequence[int], ahead_s: float, present: StateNow
 ) -> list[ForeseenLight]:
     P, times_s = present.covariance, np.array((ahead_s, ahead_s + STEP_S))
-    X, D = light_positions(State.of_row(present.row), observer, lights_m, present.rates_radps, times_s)
+    X, D = light_positions(State(present.row), observer, lights_m, present.rates_radps, times_s)
     found = []
     for light in lit:
         at, later = (pixel_of(camera, X[k, light]) for k in (0, 1))

@@ -108,8 +108,8 @@ def state_of(window: Window, fit: Fit, clock_sigma_s: float) -> tuple[State, Flo
     for n, sign in ((0, -1.0), (1, 1.0)):
         r_m += sign * fit.R[n] @ window.courses[n].a[0]
         v_mps += sign * fit.R[n] @ window.courses[n].b[0]
-    state = replace(
-        constants_of(window.nodes, fit.R, r_m, clock_sigma_s)[0],
+    untold, _ = constants_of(window.nodes, fit.R, r_m, clock_sigma_s)
+    state = untold.with_parts(
         v_mps=v_mps,
         gyro_bias_radps=fit.own[:, 0:3],
         accel_bias_mps2=fit.own[:, 3:6],

@@ -154,7 +154,7 @@ class TrackPool(TrackSteps):
             v_mps = state.v_mps - (parts.dv_mps[1] - parts.dv_mps[0])
             state = state.moved(state.r_m - v_mps * span_s - (parts.dp_m[1] - parts.dp_m[0]), v_mps, R)
             t_s = since_s
-        return replace(state, shake_rad=np.zeros((2, 3)), shove_mps=np.zeros(3))
+        return state.with_parts(shake_rad=0.0, shove_mps=0.0)
 
     def _search(self, t_s: float, sight: Sight) -> None:
         """Start from this picture alone, where nothing is confirmed, or what is explains one node's pictures only."""
@@ -266,9 +266,7 @@ class TrackPool(TrackSteps):
                 self._update_lights(child, Association(chosen, np.ones(2), 0.0), y, H, sight)
                 child.used[sight.node, sight.stamp_ns] = chosen
                 if child.steps:
-                    child.steps.last = replace(
-                        child.steps.last, after=child.state.to_row(), covariance=child.covariance
-                    )
+                    child.steps.last = replace(child.steps.last, after=child.state.row, covariance=child.covariance)
                 self.challengers.append(child)
 
     def _force(self, estimate: Estimate, sight: Sight, chosen: Chosen) -> None:

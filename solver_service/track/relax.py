@@ -43,6 +43,8 @@ from buddyline.solver_service.track.stepping import DEPTH_GATE, TrackSteps
 from buddyline.solver_service.track.strapdown import (
     integrate,
     noise_of_steps,
+    of_nodes,
+    of_pairs,
     predicted,
     propagate,
     sampled,
@@ -192,17 +194,13 @@ class PathPass(TrackSteps):
         if not len(steps.told):
             return {}
         at = first + steps.told
-        states, span_s = State.of_row(path.states[at]), np.diff(times_s)[steps.told]
-        names = ("R", "gyro_bias_radps", "accel_bias_mps2", "mount_rad", "lever_m", "delay_s")
-        of_nodes = {name: (each := getattr(states, name)).reshape(-1, *each.shape[2:]) for name in names}
-        found = integrate(replace(states, **of_nodes), replace(steps.grid, fast=None))
-        columns = {name: each for name, each in vars(found).items() if each is not None}
-        parts = replace(found, **{name: each.reshape(-1, 2, *each.shape[1:]) for name, each in columns.items()})
+        states, span_s = State(path.states[at]), np.diff(times_s)[steps.told]
+        parts = of_pairs(integrate(of_nodes(states), replace(steps.grid, fast=None)))
         after, F = propagate(states, parts, span_s)
         noises = [self._noises(main, t_s) for t_s in path.t_s[at + 1].tolist()]
         densities, variances = np.stack([sampled(each) for each in noises], axis=1), main.shaking.variances
         Q, walk, shaken = noise_of_steps(after, parts, densities, np.tile(variances, (len(at), 1)), span_s)
-        missed = after.minus(State.of_row(path.states[at + 1]))
+        missed = after.minus(State(path.states[at + 1]))
         sudden_rad = steps.values[..., 12].max(axis=2)
         lost = np.array([self._with_sudden(np.zeros(3), turn) for turn in sudden_rad]) / variances
         self._shaking = variances
@@ -335,6 +333,6 @@ def clock_sigma_s(path: Path) -> float:
 def _stays(old: Path, new: Path, sigmas: float) -> bool:
     """Whether a pass over a dive has left each pose within so many sigmas of where the pass before had it."""
     at = np.arange(0, len(new), LOOKED_AT)
-    moved = State.of_row(new.states[at]).minus(State.of_row(old.states[at]))[:, :NAV, None]
+    moved = State(new.states[at]).minus(State(old.states[at]))[:, :NAV, None]
     chi2 = np.swapaxes(moved, 1, 2) @ np.linalg.solve(new.covariance(at)[:, :NAV, :NAV], moved)
     return bool((chi2 < NAV * sigmas**2).all())

@@ -162,7 +162,7 @@ class TrackSights(TrackMoves):
             dt_s[n, :of], dt_s[n, of:] = sight.dt_s, sight.dt_s[-1] if of else 0.0
             dt_s[n] += guide.look.t_s - path.t_s[guide.step]
         lights_m = self.nodes[1 - observer].rig.lights_m
-        X, D = light_positions(State.of_row(path.states[at]), observer, lights_m, path.rates_radps[at], dt_s)
+        X, D = light_positions(State(path.states[at]), observer, lights_m, path.rates_radps[at], dt_s)
         y, H = residuals(bearings, tangents, X, D)
         P = path.covariance(at)
         # The rows of lights that a picture did not use stay 0, and tell nothing.

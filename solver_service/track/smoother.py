@@ -20,6 +20,12 @@ from numpy.typing import NDArray
 # What rows and pictures need of a covariance: of COLUMNS, half.
 _UPPER: Final = np.triu_indices(len(COLUMNS))
 _BLOCK_UPPER: Final = COLUMNS[_UPPER[0]], COLUMNS[_UPPER[1]]
+# Of Q, for both attitudes and the velocity: its variance, that of the shaking, and how one moves the other.
+_SHAKING: Final = ((PHI[0], SHAKE[0]), (PHI[1], SHAKE[1]), (V_, SHOVE))
+_DRAWN: Final = (
+    np.array([(by.start, off.start, *np.repeat(np.r_[by], 3)) for by, off in _SHAKING]),
+    np.array([(by.start, off.start, *np.tile(np.r_[off], 3)) for by, off in _SHAKING]),
+)
 # So many rows are made at once.
 TOGETHER: Final = 256
 # Over so many steps a turn rate's swings are averaged.
@@ -30,7 +36,7 @@ SWINGS: Final = 20
 class Path:
     """Smoothed steps as columns, in order of time.
 
-    t_s, light_s (N,), lights (N,), rates_radps (N, 2, 3): of the steps. states: rows of State.to_row. halves: of the
+    t_s, light_s (N,), lights (N,), rates_radps (N, 2, 3): of the steps. states: State.row of each. halves: of the
     covariance of COLUMNS, its upper half. drawn (N, 5): variances that noise added in the step before: of A's and B's
     attitude by shaking, of both by their samples, and of the velocity by shaking. without (N, 2): which node had no
     inertial unit in that step. oldest (SIZE, SIZE): the whole covariance at the first step.
@@ -68,7 +74,7 @@ class Path:
 
     def state(self, k: int) -> State:
         """Give the state at a step."""
-        return State.of_row(self.states[k])
+        return State(self.states[k])
 
     @cached_property
     def swings(self) -> Floats:
@@ -108,7 +114,7 @@ def smoothed(steps: Trail, about: Path | None = None) -> Path:
         looks=looks,
         oldest=np.empty((SIZE, SIZE)),
     )
-    later = None
+    drawn, later = np.empty((count, *_DRAWN[0].shape)), None
     # A state's row, or the error against the path.
     here = np.zeros(0)
     for k, step in zip(range(count - 1, -1, -1), steps.backward(), strict=True):
@@ -120,24 +126,25 @@ def smoothed(steps: Trail, about: Path | None = None) -> Path:
             across[:, :MOVING] = step.covariance @ later.F.T
             gain = np.linalg.solve(P_before, across.T).T
             if about is None:
-                error = State.of_row(here).minus(State.of_row(later.before))
-                here = State.of_row(step.after).plus(gain @ error).to_row()
+                error = State(here).minus(State(later.before))
+                here = State(step.after).plus(gain @ error).row
             else:
                 here = step.after + gain @ (here - later.before)
             P = step.covariance + gain @ (P - P_before) @ gain.T
             P = 0.5 * (P + P.T)
         path.t_s[k], path.light_s[k], path.lights[k] = step.t_s, step.light_s, step.lights
         found[k], path.halves[k] = here, P[_BLOCK_UPPER]
-        path.drawn[k], path.without[k] = _drawn(step.Q)
+        drawn[k] = step.Q[_DRAWN]
         path.rates_radps[k] = step.rates_radps
         looks[k] = step.looks
         later = step
     if count:
         path.oldest[:] = P
+        path.drawn[:], path.without[:] = _drawn(drawn)
         # A path may go on after the last picture, where a pass about it ends.
-        states = State.of_row(np.array(found) if about is None else about.states[:count])
+        states = State(np.array(found) if about is None else about.states[:count])
         states = states if about is None else states.plus(np.array(found))
-        path.states[:] = states.to_row()
+        path.states[:] = states.row
         # Without a unit the turn rate is estimated, too (strapdown.process_noise).
         np.copyto(path.rates_radps, -states.gyro_bias_radps, where=path.without[..., None])
     return path
@@ -162,7 +169,7 @@ def _rows_together(path: Path, times_s: Floats, stamps_ns: Sequence[int]) -> lis
     a = (times_s - path.t_s[one]) / span
     # Cubic Hermite polynomials: of the end point, and of the slopes at both ends.
     end, slope0, slope1 = a * a * (3.0 - 2.0 * a), span * a * (1.0 - a) ** 2, span * a * a * (a - 1.0)
-    before, after = State.of_row(path.states[one]), State.of_row(path.states[two])
+    before, after = State(path.states[one]), State(path.states[two])
     r = before.r_m + end[:, None] * (after.r_m - before.r_m)
     r += slope0[:, None] * before.v_mps + slope1[:, None] * after.v_mps
     v = before.v_mps + a[:, None] * (after.v_mps - before.v_mps)
@@ -188,14 +195,14 @@ def _rows_together(path: Path, times_s: Floats, stamps_ns: Sequence[int]) -> lis
     )
 
 
-def _drawn(Q: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Give a row of Path.drawn and of Path.without for a step's Q (MOVING, MOVING)."""
-    of = np.diag(Q)[[PHI[0].start, PHI[1].start, V_.start, SHAKE[0].start, SHAKE[1].start, SHOVE.start]]
+def _drawn(noted: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Give Path.drawn and Path.without (N, ...) of what was noted (N, 3, 11) of steps' Q, as _DRAWN picks it."""
+    of = noted[..., :2]
     # Without a unit its shaking is drawn, but moves nothing.
-    moved = np.array([Q[PHI[0], SHAKE[0]].any(), Q[PHI[1], SHAKE[1]].any(), Q[V_, SHOVE].any()])
-    shaken = np.where(moved, of[3:], 0.0)
-    without = np.asarray(~moved[:2] & (of[:2] > 0.0))
-    return np.array((*shaken[:2], *(of[:2] - shaken[:2]), shaken[2])), without
+    moved = np.asarray(noted[..., 2:].any(axis=-1))
+    shaken = np.where(moved, of[..., 1], 0.0)
+    without = np.asarray(~moved[:, :2] & (of[:, :2, 0] > 0.0))
+    return np.concatenate((shaken[:, :2], of[:, :2, 0] - shaken[:, :2], shaken[:, 2:]), axis=1), without
 
 
 def _unseen(path: Path, states: State, two: NDArray[np.intp], span_s: Floats, share: Floats) -> Floats:

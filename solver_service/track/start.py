@@ -54,19 +54,9 @@ def constants_of(
 ) -> tuple[State, Floats]:
     """Give a state at r_m (3,), R (2, 3, 3), at rest, with the constants as told, and the variances (SIZE,) of all
     but position and attitude."""
-    state = State(
-        r_m=r_m,
-        v_mps=np.zeros(3),
-        R=R,
-        shake_rad=np.zeros((2, 3)),
-        shove_mps=np.zeros(3),
-        gyro_bias_radps=np.zeros((2, 3)),
-        accel_bias_mps2=np.zeros((2, 3)),
-        mount_rad=np.zeros((2, 3)),
+    state = State.at_rest(r_m, R).with_parts(
         lever_m=np.stack([np.zeros(3) if node.imu_m is None else node.imu_m for node in nodes]),
         delay_s=np.array([(node.imu_delay_ns or 0) * 1e-9 for node in nodes]),
-        clock_s=0.0,
-        depth_offset_m=0.0,
     )
     sigma = np.zeros(SIZE)
     sigma[V_] = SPEED_MPS

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -29,42 +28,102 @@ NAV: Final = 12
 MOVING: Final = 21
 """The first errors, which a step moves; the others are constants or walk slowly."""
 
-# The shapes of a state's fields, where each ends in a row, all of that for each field, and how long a row is.
-_SHAPES: Final = ((3,), (3,), (2, 3, 3), (2, 3), (3,), (2, 3), (2, 3), (2, 3), (2, 3), (2,), (), ())
-_ENDS: Final = np.cumsum([math.prod(shape) for shape in _SHAPES]).tolist()
-_PARTS: Final = list(zip([0, *_ENDS], _ENDS, _SHAPES, strict=False))
-ROW: Final = _ENDS[-1]
-CLOCK_COLUMN: Final = ROW - 2
+# Where each quantity stands in a state's row. R has nine numbers a node where the errors have three; from there on rows
+# and errors have the same order.
+_R: Final = slice(6, 24)
+_AFTER_R: Final = slice(_R.stop, None)
+_SHOVE: Final = slice(30, 33)
+_CONSTANTS: Final = _SHOVE.stop
+_PER_NODE: Final = [slice(k, k + 6) for k in (24, *range(_CONSTANTS, _CONSTANTS + 24, 6))]
+_SHAKE, _GYRO_BIAS, _ACCEL_BIAS, _MOUNT, _LEVER = _PER_NODE
+_DELAY: Final = slice(57, 59)
+CLOCK_COLUMN: Final = 59
+_DEPTH_OFFSET: Final = 60
+ROW: Final = 61
+_BOTH: Final = slice(PHI[0].start, PHI[1].stop)
 _THREE: Final = 3.0 * np.eye(3)
 _STILL: Final[Floats] = np.eye(MOVING)
 _OF_PLACE: Final = np.r_[R_, PHI[0], PHI[1]]
 _PLACE: Final = np.ix_(_OF_PLACE, _OF_PLACE)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class State:
     """Where both nodes are, in a level frame (z down; north-east-down where a compass says so), and their constants.
 
-    r_m, v_mps (3,): of B's camera from A's. R (2, 3, 3): each camera to level. shake_rad (2, 3): how far each unit is
-    shaken out of its mount at this time, camera axes; shove_mps (3,): what the shaking adds to the velocity that the
-    units tell, level axes. gyro_bias_radps, accel_bias_mps2, mount_rad, lever_m (2, 3): in camera axes; mount: the
-    small turn that brings the unit's axes, as stated, to the true ones. delay_s (2,): the unit's stamps minus true
-    time. clock_s: B's clock minus A's. depth_offset_m: what B's gauge shows too much against A's. As rows of numbers
-    states are kept; several rows make a batch of states, each array with leading axes.
+    row (ROW,): all its numbers, which the quantities below are views of. Several rows (..., ROW) are a batch of states,
+    whose quantities have the same leading axes.
     """
 
-    r_m: Floats
-    v_mps: Floats
-    R: Floats
-    shake_rad: Floats
-    shove_mps: Floats
-    gyro_bias_radps: Floats
-    accel_bias_mps2: Floats
-    mount_rad: Floats
-    lever_m: Floats
-    delay_s: Floats
-    clock_s: float
-    depth_offset_m: float
+    row: Floats
+
+    @classmethod
+    def at_rest(cls, r_m: Floats, R: Floats) -> State:
+        """Return a state of which all else is 0."""
+        return cls(np.zeros((*r_m.shape[:-1], ROW))).moved(r_m, np.zeros(3), R)
+
+    @property
+    def r_m(self) -> Floats:
+        """Of B's camera from A's (3,)."""
+        return self.row[..., R_]
+
+    @property
+    def v_mps(self) -> Floats:
+        """Its change (3,)."""
+        return self.row[..., V_]
+
+    @property
+    def R(self) -> Floats:
+        """Each camera to level (2, 3, 3)."""
+        return self.row[..., _R].reshape(*self.row.shape[:-1], 2, 3, 3)
+
+    @property
+    def shake_rad(self) -> Floats:
+        """How far each unit is shaken out of its mount at this time (2, 3), camera axes."""
+        return self._of_nodes(_SHAKE)
+
+    @property
+    def shove_mps(self) -> Floats:
+        """What the shaking adds to the velocity that the units tell (3,), level axes."""
+        return self.row[..., _SHOVE]
+
+    @property
+    def gyro_bias_radps(self) -> Floats:
+        """What the gyros show too much (2, 3), camera axes."""
+        return self._of_nodes(_GYRO_BIAS)
+
+    @property
+    def accel_bias_mps2(self) -> Floats:
+        """What the accelerometers show too much (2, 3), camera axes."""
+        return self._of_nodes(_ACCEL_BIAS)
+
+    @property
+    def mount_rad(self) -> Floats:
+        """The small turns that bring the units' axes, as stated, to the true ones (2, 3), camera axes."""
+        return self._of_nodes(_MOUNT)
+
+    @property
+    def lever_m(self) -> Floats:
+        """The units' places (2, 3), camera axes."""
+        return self._of_nodes(_LEVER)
+
+    @property
+    def delay_s(self) -> Floats:
+        """The units' stamps minus true time (2,)."""
+        return self.row[..., _DELAY]
+
+    @property
+    def clock_s(self) -> float:
+        """B's clock minus A's; of a batch an array."""
+        return self.row[..., CLOCK_COLUMN][()]  # type: ignore[return-value]
+
+    @property
+    def depth_offset_m(self) -> float:
+        """What B's gauge shows too much against A's; of a batch an array."""
+        return self.row[..., _DEPTH_OFFSET][()]  # type: ignore[return-value]
+
+    def _of_nodes(self, part: slice) -> Floats:
+        return self.row[..., part].reshape(*self.row.shape[:-1], 2, 3)
 
     def plus(self, error: Floats) -> State:
         """Return the state that is off this one by an error (SIZE,); of a batch, with leading axes.
@@ -75,73 +134,56 @@ class State:
         leave open stays on its circle, however large it is (docs/track.md, consistency). What rounding does to R is
         mended by the next step (strapdown.integrate).
         """
-        phi = error[..., PHI[0]]
-        psi = error[..., PHI[1]] - phi
-        turn_a, turn_b = rotation_exp(phi), rotation_exp(psi)
         lead = error.shape[:-1]
-        R = np.empty((*lead, 2, 3, 3))
-        R[..., 0, :, :], R[..., 1, :, :] = turn_a @ self.R[..., 0, :, :], turn_a @ turn_b @ self.R[..., 1, :, :]
-        shake, gyro, accel, mount, lever = (
-            error[..., k : k + 6].reshape(*lead, 2, 3) for k in (SHAKE[0].start, *range(MOVING, DELAY[0], 6))
-        )
-        return State(
-            r_m=applied(turn_a, applied(turn_b, self.r_m) + applied(left_jacobian(psi), error[..., R_])),
-            v_mps=applied(turn_a, self.v_mps + error[..., V_]),
-            R=R,
-            shake_rad=self.shake_rad + shake,
-            shove_mps=applied(turn_a, self.shove_mps + error[..., SHOVE]),
-            gyro_bias_radps=self.gyro_bias_radps + gyro,
-            accel_bias_mps2=self.accel_bias_mps2 + accel,
-            mount_rad=self.mount_rad + mount,
-            lever_m=self.lever_m + lever,
-            delay_s=self.delay_s + error[..., DELAY[0] : DELAY[1] + 1],
-            clock_s=self.clock_s + error[..., CLOCK],  # type: ignore[arg-type]
-            depth_offset_m=self.depth_offset_m + error[..., DEPTH_OFFSET],  # type: ignore[arg-type]
-        )
+        screws = error[..., _BOTH].reshape(*lead, 2, 3).copy()
+        psi = screws[..., 1, :]
+        psi -= screws[..., 0, :]
+        turns = rotation_exp(screws)
+        turn_a, turn_b = turns[..., 0, :, :], turns[..., 1, :, :]
+        off = State(np.empty((*lead, ROW)))
+        off.row[..., _AFTER_R] = self.row[..., _AFTER_R] + error[..., NAV:]
+        off.r_m[...] = applied(turn_a, applied(turn_b, self.r_m) + applied(left_jacobian(psi), error[..., R_]))
+        off.v_mps[...] = applied(turn_a, self.v_mps + error[..., V_])
+        off.shove_mps[...] = applied(turn_a, off.shove_mps)
+        R, was = off.R, self.R
+        R[..., 0, :, :], R[..., 1, :, :] = turn_a @ was[..., 0, :, :], turn_a @ turn_b @ was[..., 1, :, :]
+        return off
 
     def minus(self, other: State) -> Floats:
         """Return the error (SIZE,) by which this state is off another: other.plus(error) is this one.
 
         Of batches, with leading axes.
         """
-        error = np.empty((*self.r_m.shape[:-1], SIZE))
-        flat = (*error.shape[:-1], 6)
-        phi = rotation_log(self.R[..., 0, :, :] @ np.swapaxes(other.R[..., 0, :, :], -1, -2))
+        error = np.empty((*self.row.shape[:-1], SIZE))
+        R, other_R = self.R, other.R
+        phi = rotation_log(R[..., 0, :, :] @ np.swapaxes(other_R[..., 0, :, :], -1, -2))
         back = rotation_exp(-phi)
-        turn = back @ self.R[..., 1, :, :] @ np.swapaxes(other.R[..., 1, :, :], -1, -2)
+        turn = back @ R[..., 1, :, :] @ np.swapaxes(other_R[..., 1, :, :], -1, -2)
         psi = rotation_log(turn)
-        error[..., PHI[0]], error[..., PHI[1]] = phi, phi + psi
         along = applied(back, self.r_m) - applied(turn, other.r_m)
         error[..., R_] = np.linalg.solve(left_jacobian(psi), along[..., None])[..., 0]
         error[..., V_] = applied(back, self.v_mps) - other.v_mps
-        error[..., 12:18] = (self.shake_rad - other.shake_rad).reshape(flat)
+        error[..., PHI[0]], error[..., PHI[1]] = phi, phi + psi
+        error[..., NAV:] = self.row[..., _AFTER_R] - other.row[..., _AFTER_R]
         error[..., SHOVE] = applied(back, self.shove_mps) - other.shove_mps
-        error[..., 21:27] = (self.gyro_bias_radps - other.gyro_bias_radps).reshape(flat)
-        error[..., 27:33] = (self.accel_bias_mps2 - other.accel_bias_mps2).reshape(flat)
-        error[..., 33:39] = (self.mount_rad - other.mount_rad).reshape(flat)
-        error[..., 39:45] = (self.lever_m - other.lever_m).reshape(flat)
-        error[..., 45:47] = self.delay_s - other.delay_s
-        error[..., CLOCK] = self.clock_s - other.clock_s
-        error[..., DEPTH_OFFSET] = self.depth_offset_m - other.depth_offset_m
         return error
-
-    def to_row(self) -> Floats:
-        """Return all numbers as one row (ROW,), of a batch as rows (..., ROW)."""
-        if self.r_m.ndim == 1:
-            return np.concatenate([np.ravel(part) for part in vars(self).values()])
-        lead = self.r_m.shape[:-1]
-        return np.concatenate([np.reshape(part, (*lead, -1)) for part in vars(self).values()], axis=-1)
-
-    @classmethod
-    def of_row(cls, rows: Floats) -> State:
-        """Return the state of a row, or the batch of rows (..., ROW)."""
-        lead = rows.shape[:-1]
-        shaped = [rows[..., start:end].reshape((*lead, *shape)) for start, end, shape in _PARTS]
-        return cls(*(part if part.ndim else float(part) for part in shaped))  # type: ignore[arg-type]
 
     def moved(self, r_m: Floats, v_mps: Floats, R: Floats) -> State:
         """Return the same constants elsewhere."""
-        return replace(self, r_m=r_m, v_mps=v_mps, R=R)
+        there = State(self.row.copy())
+        there.r_m[...], there.v_mps[...], there.R[...] = r_m, v_mps, R
+        return there
+
+    def with_parts(self, **parts: Floats | float) -> State:
+        """Return a state whose named quantities are others."""
+        changed = State(self.row.copy())
+        at = {"clock_s": CLOCK_COLUMN, "depth_offset_m": _DEPTH_OFFSET}
+        for name, value in parts.items():
+            if name in at:
+                changed.row[..., at[name]] = value
+            else:
+                getattr(changed, name)[...] = value
+        return changed
 
 
 def orthonormal(R: Floats) -> Floats:
@@ -163,7 +205,7 @@ def invariant_of_plain(state: State) -> Floats:
 def _turned_with(state: State, sign: float) -> Floats:
     """Give both, of a batch of states with its leading axes."""
     across = skew(sign * np.array((state.r_m, state.v_mps, state.shove_mps)))
-    T = np.empty((*state.r_m.shape[:-1], MOVING, MOVING))
+    T = np.empty((*state.row.shape[:-1], MOVING, MOVING))
     T[...] = _STILL
     T[..., R_, PHI[1]], T[..., V_, PHI[0]], T[..., SHOVE, PHI[0]] = across
     return T

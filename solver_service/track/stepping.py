@@ -78,7 +78,7 @@ class TrackSteps(TrackSights):
             last = estimate.steps.last
             estimate.steps.last = replace(
                 last,
-                after=estimate.state.to_row(),
+                after=estimate.state.row,
                 covariance=estimate.covariance,
                 light_s=estimate.light_s,
                 lights=estimate.lights,
@@ -88,8 +88,8 @@ class TrackSteps(TrackSights):
             estimate.steps.append(
                 Step(
                     t_s=t_s,
-                    before=before.to_row(),
-                    after=estimate.state.to_row(),
+                    before=before.row,
+                    after=estimate.state.row,
                     covariance=estimate.covariance,
                     F=moved[0],
                     Q=moved[1],
@@ -188,6 +188,6 @@ class TrackSteps(TrackSights):
     def _open(self, estimate: Estimate) -> None:
         if self._keep_s:
             still = np.eye(SIZE)[:MOVING], np.zeros((MOVING, MOVING)), np.zeros(SIZE - MOVING)
-            row, rates = estimate.state.to_row(), estimate.rates_radps
+            row, rates = estimate.state.row, estimate.rates_radps
             first = Step(estimate.t_s, row, row, estimate.covariance, *still, rates, estimate.light_s, 0)
             estimate.steps.append(first)

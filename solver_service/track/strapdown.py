@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Final, Protocol, TypeAlias
 
 import numpy as np
@@ -113,6 +113,18 @@ class Carried(Protocol):
     @property
     def delay_s(self) -> Floats:
         """The units' stamps minus true time."""
+
+
+@dataclass(frozen=True, eq=False)
+class NodesCarried:
+    """The same as numbers."""
+
+    R: Floats
+    gyro_bias_radps: Floats
+    accel_bias_mps2: Floats
+    mount_rad: Floats
+    lever_m: Floats
+    delay_s: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,6 +273,18 @@ def integrate(state: Carried, grid: SampleGrid) -> Increments:
     )
 
 
+def of_nodes(states: State) -> NodesCarried:
+    """Give what both nodes of pairs (N) start from, each on its own (2 N)."""
+    every = (getattr(states, each.name) for each in fields(NodesCarried))
+    return NodesCarried(*(each.reshape(-1, *each.shape[2:]) for each in every))
+
+
+def of_pairs(found: Increments) -> Increments:
+    """Give nodes' (2 N) increments as those of pairs (N), with leading axes."""
+    told = {name: each for name, each in vars(found).items() if each is not None}
+    return replace(found, **{name: each.reshape(-1, 2, *each.shape[1:]) for name, each in told.items()})
+
+
 def kept_shares(without: Bools, noises: tuple[Noise, Noise], span_s: float) -> Floats:
     """Give the shares (2,) of the units' angles in their mounts that are left after a step.
 
@@ -292,14 +316,11 @@ def propagate(
     shake = felt[..., None] * state.shake_rad
     off = rotation_exp((state.R @ shake[..., None])[..., 0])
     R = off @ parts.R @ rotation_exp(-kept_angle[..., None] * shake)
-    after = replace(
-        state,
-        r_m=state.r_m + state.v_mps * span + back_s * state.shove_mps + dp,
-        v_mps=state.v_mps + gone * state.shove_mps + dv,
-        R=R,
-        shake_rad=kept_angle[..., None] * state.shake_rad,
-        shove_mps=kept * state.shove_mps,
+    after = state.moved(
+        state.r_m + state.v_mps * span + back_s * state.shove_mps + dp, state.v_mps + gone * state.shove_mps + dv, R
     )
+    after.shake_rad[...] *= kept_angle[..., None]
+    after.shove_mps[...] *= kept
     F = np.zeros((*parts.without.shape[:-1], MOVING, SIZE))
     F[..., _ROWS, _COLUMNS] = _SIGNS * parts.jacobian
     F[..., R_, R_] = F[..., V_, V_] = _IDENTITY

@@ -1,6 +1,6 @@
 """Steps that are integrated together, in each node's own axes, say the same as each by itself."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -45,8 +45,8 @@ def of_step(samples: list[Samples], about: State, state: State, k: int) -> tuple
 @pytest.mark.parametrize("k", range(len(TIMES_S) - 1))
 def test_steps_together_are_each_step(k: int) -> None:
     rng = np.random.default_rng(k)
-    samples, state = [shaken(rng), shaken(rng)], replace(a_state(k), delay_s=DELAYS_S)
-    together, alone = of_step(samples, replace(a_state(9), **_constants(state)), state, k)
+    samples, state = [shaken(rng), shaken(rng)], a_state(k).with_parts(delay_s=DELAYS_S)
+    together, alone = of_step(samples, a_state(9).with_parts(**_constants(state)), state, k)
     assert max(apart(together, alone).values()) < 1e-12
     assert together.by_fast is not None
 
@@ -55,11 +55,11 @@ def test_steps_together_are_each_step(k: int) -> None:
 def test_constants_that_changed_since_are_made_good(k: int) -> None:
     """What is left is far below a step's noise: 5e-4 rad and 5e-3 m/s of shaking."""
     rng = np.random.default_rng(k)
-    samples, state = [shaken(rng), shaken(rng)], replace(a_state(k), delay_s=DELAYS_S)
+    samples, state = [shaken(rng), shaken(rng)], a_state(k).with_parts(delay_s=DELAYS_S)
     changed = _constants(state)
     for (name, value), tolerance in zip(changed.items(), TOLERANCES[[0, 3, 6, 9, 12]], strict=True):
         changed[name] = value + tolerance * rng.choice((-1.0, 1.0), value.shape)
-    about = replace(state, **changed)
+    about = state.with_parts(**changed)
     together, alone = of_step(samples, about, state, k)
     off = apart(together, alone)
     unmended = apart(increments(samples, about, *TIMES_S[k : k + 2], by_shares=True), alone)
@@ -70,7 +70,7 @@ def test_constants_that_changed_since_are_made_good(k: int) -> None:
 
 def test_a_step_that_samples_do_not_tell_is_left_out() -> None:
     rng = np.random.default_rng(1)
-    state = replace(a_state(1), delay_s=DELAYS_S)
+    state = a_state(1).with_parts(delay_s=DELAYS_S)
     ahead = steps_ahead([shaken(rng), shaken(rng, hole=True)], state, TIMES_S, HOLD_S, by_shares=False)
     assert sorted(ahead.at) == [(1.0, 1.103), (1.103, 1.2), (1.3004, 1.35)]
     past = steps_ahead([shaken(rng), shaken(rng)], state, (0.0, 0.1, 1.9, 2.0), HOLD_S, by_shares=False)

@@ -75,6 +75,6 @@ def test_a_pair_at_rest_is_not_believed() -> None:
     filtered.advance(last_ns(dive.records))
     (part,) = parts_of(filtered)
     for offset_s, sigma_s, off in ((-0.055, 0.0143, False), (0.251, 0.0095, True), (0.05, 0.0015, True)):
-        part.state = replace(part.state, clock_s=offset_s)
+        part.state = part.state.with_parts(clock_s=offset_s)
         part.covariance[CLOCK, CLOCK] = sigma_s**2
         assert clock_off_by(part, 0.005) == off

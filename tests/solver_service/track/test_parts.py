@@ -26,7 +26,7 @@ def part() -> Estimate:
 def test_tracks_that_disagree_on_the_clocks_are_in_pieces(
     part: Estimate, parts_clock_s: list[float], expected: bool
 ) -> None:
-    parts = [replace(part, state=replace(part.state, clock_s=clock_s)) for clock_s in parts_clock_s]
+    parts = [replace(part, state=part.state.with_parts(clock_s=clock_s)) for clock_s in parts_clock_s]
     assert in_pieces(parts) is expected
 
 
@@ -48,7 +48,7 @@ def test_a_track_of_nearly_all_of_a_dive_goes_on(
     part: Estimate, parts_s: list[tuple[float, float, float]], expected: bool
 ) -> None:
     parts = [
-        replace(part, start_s=start_s, t_s=end_s + 0.5, end_s=end_s, state=replace(part.state, clock_s=clock_s))
+        replace(part, start_s=start_s, t_s=end_s + 0.5, end_s=end_s, state=part.state.with_parts(clock_s=clock_s))
         for start_s, end_s, clock_s in parts_s
     ]
     for one in parts:
@@ -79,7 +79,7 @@ def test_a_track_that_contradicts_the_others_on_the_clocks_is_left_out(
         replace(
             part,
             t_s=part.t_s + (300.0 * k if clock_s == 0.02 else k),
-            state=replace(part.state, clock_s=clock_s),
+            state=part.state.with_parts(clock_s=clock_s),
             covariance=covariance,
             evidence=explained,
         )

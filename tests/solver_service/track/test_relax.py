@@ -32,7 +32,7 @@ def passed_about(dive: KnownDive, path: Path) -> Path:
 
 def off_by(path: Path, error: Floats) -> Path:
     """A path that is off, says so, and has used no light."""
-    states = np.stack([path.state(k).plus(error).to_row() for k in range(len(path))])
+    states = np.stack([path.state(k).plus(error).row for k in range(len(path))])
     looks = [tuple(replace(look, chosen=()) for look in of_step) for of_step in path.looks]
     return replace(path, states=states, halves=1e3 * path.halves, looks=looks)
 

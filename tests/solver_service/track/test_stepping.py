@@ -41,7 +41,7 @@ def of_light(state: State, sight: Sight) -> tuple[Floats, Floats]:
 
 def test_a_picture_of_a_counts_the_product_of_clock_and_velocity_errors() -> None:
     """Gauss-Hermite's three points are exact for the squares of such products."""
-    state = replace(a_state(2), clock_s=0.0)
+    state = a_state(2).with_parts(clock_s=0.0)
     rig = make(1, Setting(seconds=1.0)).records[0].node.rig
     X, D = light_positions(state, 0, LIGHTS_M, np.zeros((2, 3)), np.zeros(1))
     pixel = np.array((409.5, 307.5)) + 900.0 * X[0, 0, :2] / X[0, 0, 2]
@@ -128,7 +128,7 @@ def startled(offs: Floats) -> list[bool]:
     """Say after which attitudes of B, off their prediction by offs (N, 3) sigmas, it is taken to have begun to turn."""
     dive = make(1, Setting(seconds=1.0))
     track = TrackFilter(dive.records[0].node, dive.records[1].node)
-    state = replace(a_state(4), mount_rad=np.zeros((2, 3)), shake_rad=np.zeros((2, 3)))
+    state = a_state(4).with_parts(mount_rad=0.0, shake_rad=0.0)
     estimate = Estimate(0.0, state, np.zeros((SIZE, SIZE)), 0.0, without=[False, True])
     still = Noise(0.0, 0.0, gap_rate_radps=0.0, gap_tilt_rad=0.0, gap_heading_rad=0.0)
     F = np.eye(SIZE)[:MOVING]

@@ -235,7 +235,7 @@ def test_passes_that_diverge_are_no_track(monkeypatch: pytest.MonkeyPatch) -> No
     def diverging(steps: Trail, about: Path) -> Path:
         """Its clocks are 0.7 s apart."""
         path = smoothed(steps, about)
-        return replace(path, states=np.array([replace(path.state(k), clock_s=-0.7).to_row() for k in range(len(path))]))
+        return replace(path, states=np.array([path.state(k).with_parts(clock_s=-0.7).row for k in range(len(path))]))
 
     assert list(smooth(short.records, short.fixes, short.stamps_ns).rows)
     monkeypatch.setattr(relax, "smoothed", diverging)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -42,10 +41,8 @@ def a_state(seed: int) -> State:
     R_a = rotation_exp(rng.normal(0.0, 0.3, 3)) @ np.array(((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     t_a_b = np.array((0.3, -0.2, 4.0)) + rng.normal(0.0, 0.2, 3)
     R_b = R_a @ rotation_exp(np.array((0.0, np.pi, 0.0))) @ rotation_exp(rng.normal(0.0, 0.1, 3))
-    return State(
-        r_m=R_a @ t_a_b,
+    return State.at_rest(R_a @ t_a_b, np.stack((R_a, R_b))).with_parts(
         v_mps=rng.normal(0.0, 0.5, 3),
-        R=np.stack((R_a, R_b)),
         shake_rad=rng.normal(0.0, 1e-3, (2, 3)),
         shove_mps=rng.normal(0.0, 0.05, 3),
         gyro_bias_radps=rng.normal(0.0, 0.02, (2, 3)),
@@ -174,7 +171,7 @@ def increments(state: State) -> Increments:
 def test_transition(seed: int, arm: bool) -> None:
     state = a_state(seed)
     if not arm:
-        state = replace(state, lever_m=np.zeros((2, 3)), mount_rad=np.zeros((2, 3)))
+        state = state.with_parts(lever_m=0.0, mount_rad=0.0)
     after, F = propagate(state, increments(state), 0.1)
 
     def moved(error: Floats) -> Floats:
@@ -221,12 +218,12 @@ def test_a_places_covariance_there_and_back() -> None:
 
 def test_a_rows_covariance_holds_how_the_arc_is_bent() -> None:
     """By many states about one whose turn is poorly known: the place's second moment, beyond the first order."""
-    state, still = replace(a_state(2), clock_s=0.0), np.zeros((2, 3))
+    state, still = a_state(2).with_parts(clock_s=0.0), np.zeros((2, 3))
     sigma = np.full(NAV, 1e-4)
     sigma[PHI[1]] = 0.1
     P = np.zeros((len(COLUMNS), len(COLUMNS)))
     P[:NAV, :NAV] = np.diag(sigma**2)
-    batch = State.of_row(state.to_row()[None])
+    batch = State(state.row[None])
     told = rows_of((0,), batch, P[None], still[None], np.array((2,)), np.zeros(1))[0]
     assert told is not None
     error = np.zeros((4000, SIZE))

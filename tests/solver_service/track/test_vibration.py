@@ -89,7 +89,7 @@ def test_what_a_share_moves(column: int) -> None:
         of_sensor = slice(3 * (column % 2), 3 * (column % 2) + 3)
         values[column // 2, :, of_sensor] -= share * fast[column // 2, :, of_sensor]
         told = np.ones((2, 40), dtype=bool)
-        still = replace(state, lever_m=np.zeros((2, 3)))
+        still = state.with_parts(lever_m=0.0)
         both = integrate(still, SampleGrid(np.stack((grid, grid)), values, told, values[:, [0, -1], 3:], fast))
         assert both.by_fast is not None
         moved, _ = propagate(still, both, 0.1)

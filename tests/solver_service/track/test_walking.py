@@ -159,7 +159,7 @@ def tilting(walking: Walking, seen: Floats, *, learns: bool) -> tuple[Walking, F
         shares = kept_shares(parts.without, noises, STEP_S)
         F = F_still.copy()
         F[SHAKE[0], SHAKE[0]] = F[SHAKE[1], SHAKE[1]] = shares[0] * np.eye(3)
-        after = replace(estimate.state, shake_rad=shares[:, None] * estimate.state.shake_rad)
+        after = estimate.state.with_parts(shake_rad=shares[:, None] * estimate.state.shake_rad)
         guessed, drift = TrackSteps._guessed(estimate, after, F, parts, noises, noises, STEP_S, shares)
         added = guessed_noise(parts, noises, STEP_S, shares)[2]
         walking = walking.stepped(F, np.zeros(SIZE - MOVING), (False, False), guessed, drift)
@@ -172,10 +172,9 @@ def tilting(walking: Walking, seen: Floats, *, learns: bool) -> tuple[Walking, F
 
 
 def at_rest() -> State:
-    still = np.zeros((2, 3))
     R = np.stack((np.eye(3), np.eye(3)))
     far_m = np.array((0.0, 0.0, 5.0))
-    return State(far_m, np.zeros(3), R, still, np.zeros(3), still, still, still, still, np.zeros(2), 0.0, 0.0)
+    return State.at_rest(far_m, R)
 
 
 def unmoved() -> Increments:
