@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(as_dict(chosen, spacings), allow_nan=False))
     else:
-        print(as_text(chosen, spacings, args.baseline, args.visibility))
+        print(as_text(chosen, spacings, args.baseline, args.visibility, sigma_px))
     if args.plot is not None:
         draw(spacings, tolerances["position"], reach_m, args.plot)
     return 0
@@ -223,10 +223,13 @@ def as_dict(chosen: Plan, spacings: dict[float, Plan]) -> dict[str, Any]:
     }
 
 
-def as_text(chosen: Plan, spacings: dict[float, Plan], baseline_m: float, visibility_m: float | None) -> str:
+def as_text(
+    chosen: Plan, spacings: dict[float, Plan], baseline_m: float, visibility_m: float | None, sigma_px: float
+) -> str:
     """Return the plan for a person."""
     lines = [
-        f"lights {baseline_m:g} m apart, RMS errors to expect (the Cramér-Rao bound; azimuth with the compass)",
+        f"lights {baseline_m:g} m apart, found to {sigma_px:g} px (1 sd; --sigma-px): RMS errors to expect "
+        "(the Cramér-Rao bound; azimuth with the compass)",
         f"{'at, m':>9} {'range, m':>9} {'position, m':>12} {'azimuth, deg':>13} {'rotation, deg':>14}",
     ]
     for row in chosen.rows:

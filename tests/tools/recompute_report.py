@@ -143,6 +143,18 @@ def recompute(path: str) -> dict[str, Any]:
     truth = TruePlaces([row for _, row in of("truth")])
     frames = {row["trigger"] for node in (a, b) for _, row in log.get(f"buddyline/node/{node}/candidates", [])}
     ended = {row["trigger"] for row in (*poses, *rejected)}
+    blobs = {
+        (node, row["trigger"]): row["blobs"]
+        for node in (a, b)
+        for _, row in log.get(f"buddyline/node/{node}/candidates", [])
+    }
+    lights_px = [
+        blobs[node, row["trigger"]][k]["sigma_px"]
+        for row in poses
+        for node, chosen in ((a, row["blobs_a"]), (b, row["blobs_b"]))
+        for k in chosen
+        if 0 <= k < len(blobs.get((node, row["trigger"]), []))
+    ]
     return {
         "dive": {
             "begun": time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(start // 10**9)),
@@ -168,6 +180,7 @@ def recompute(path: str) -> dict[str, Any]:
             "range_median_m": statistics.median(row["range_m"] for row in poses),
             "sigma_median_m": statistics.median(spread(row["covariance"]) for row in poses),
             "range_gap_median_m": statistics.median(abs(row["range_gap_m"]) for row in poses),
+            "light_sigma_median_px": statistics.median(lights_px) if lights_px else None,
             "methods": dict(Counter(row["method"] for row in poses)),
             "checks": dict(Counter(check for row in poses for check in row["checks"])),
         },

@@ -209,7 +209,7 @@ def test_the_summary_has_the_track_s_errors_beside_the_poses():
     text = summary_text(summary)
     assert "track: covers 100% of the time; median error: position 20.0 mm" in text
     assert "worst position 2000 mm; 1 of 16 samples wrong" in text
-    assert "track, a second later" in text
+    assert "track with a second of delay (lag): covers" in text
 
 
 def test_a_run_without_a_track_has_no_track_figures():

@@ -137,7 +137,16 @@ def test_an_unknown_line_of_what_it_says_is_refused(tmp_path: Path, capsys: pyte
 
 def test_the_methods_have_this_dive_s_figures(dive: tuple[str, str]) -> None:
     (text,) = re.findall(r"<h2>Methods</h2><p>(.*?)</p>", dive[1])
-    for part in ("180 (90.0%)", "10 a second", "0.880 m", "range, depth", "smoothed over the whole dive", "magnetic"):
+    stated = f"a noise of {numbers_in(dive[1])['poses']['light_sigma_median_px']:.2g} px"
+    for part in (
+        "180 (90.0%)",
+        "10 a second",
+        "0.880 m",
+        stated,
+        "range, depth",
+        "smoothed over the whole dive",
+        "magnetic",
+    ):
         assert part in text, part
 
 
@@ -146,7 +155,7 @@ def test_an_outlier_is_listed_with_its_pictures(dive: tuple[str, str]) -> None:
     told: dict[str, Any] = numbers_in(page)["outliers"]
     assert (told["judged"], told["found"], told["listed"][0]["trigger"]) == (180, 1, pose(OUTLIER).trigger)
     section = page.split("<h2>Outliers")[1].split("<h2>")[0]
-    assert "1 of 180 poses" in section
+    assert "Of the 180 poses with a track at the same time 1 is further from it" in section
     assert section.count("<svg") == 2
     # The picture of a was recorded; of b there are the candidates alone.
     assert section.count("<image ") == 1

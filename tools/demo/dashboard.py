@@ -371,7 +371,7 @@ def slow_words(share: float | None) -> list[str]:
 
 
 def _track_words(mode: str, track: dict[str, Any]) -> str:
-    name = {"filter": "track", "lag": "track, a second later"}.get(mode, mode)
+    name = {"filter": "track", "lag": "track with a second of delay (lag)"}.get(mode, mode)
     return (
         f"{name}: covers {track['covered_share'] or 0.0:.0%} of the time; median error: position "
         f"{track['position_error_m'] * 1e3:.1f} mm, rotation {track['rotation_error_deg']:.2f} deg; worst position "

@@ -43,7 +43,9 @@ def from_above(
     for row, column, name, look_rad in ((a_row, middle, names[0], 0.0), (b_row, b_column, names[1], turned_rad)):
         page[row][column] = name
         page[row][column + 1] = arrows[round(look_rad / (math.pi / 4)) % 8]
-    return ["".join(line).rstrip() for line in page] + [f"from above; a row is {row_m:g} m"]
+    scale = f"from above; a row is {row_m:g} m"
+    said = f"{scale}; up is where A looks"
+    return ["".join(line).rstrip() for line in page] + [said if len(said) <= width else scale]
 
 
 def nodes_from_above(

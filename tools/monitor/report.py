@@ -164,7 +164,8 @@ def _figures(numbers: dict[str, Any]) -> str:
         if stats and stats["count"]:
             median, p95 = length_words(stats["median_m"]), length_words(stats["p95_m"])
             rows.append((f"against truth, {name}", f"{median} median, {p95} p95"))
-    return table(rows)
+    said = f"Of the track, samples {track['spacing_s']:g} s apart are counted; evaluate takes all." if track else ""
+    return table(rows) + f'<p class="dim">{said}</p>'
 
 
 def _replay(summary: Summary) -> str:
@@ -275,7 +276,7 @@ def _rig_rows(info: NodeInfo) -> list[tuple[str, str]]:
         ("left light", _vector(info.light_left_m)),
         ("right light", _vector(info.light_right_m)),
         ("light spacing", f"{math.dist(info.light_left_m, info.light_right_m):.4f} m"),
-        ("candidate noise", f"{info.sigma_px:g} px"),
+        ("candidate noise, as configured", f"{info.sigma_px:g} px"),
         ("depth port", _vector(info.depth_port_m)),
         ("declination", f"{math.degrees(info.declination_rad):.2f} deg" if info.declination_rad else
                         "not set: headings are magnetic"),
@@ -294,7 +295,8 @@ def _versions(dive: Dive, summary: Summary) -> str:
     if solver is not None:
         rows.append(("solver", solver.software))
     for reader in dive.readers:
-        noted = ", ".join(f"{key} {value}" for key, value in sorted(reader.metadata().items()))
+        notes = {"checks asked for" if key == "checks" else key: note for key, note in reader.metadata().items()}
+        noted = ", ".join(f"{key} {note}" for key, note in sorted(notes.items()))
         rows.append((reader.path.name, noted or "no notes"))
     for node in sorted(summary.picture.nodes.values(), key=lambda node: node.node):
         if node.status is not None:

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import Config
-from buddyline.protocol.messages import RelativePose, Track
+from buddyline.protocol.messages import Track
 from buddyline.tools.dives import Dive
 from buddyline.tools.estimate import sigma_m
 from buddyline.tools.evaluation.statistics import Stats
@@ -60,7 +60,7 @@ def numbers_of(dive: Dive, summary: Summary, outliers: list[Outlier] | None, abo
                 for stretch in gaps
             ],
         },
-        "poses": _of_poses(summary.poses),
+        "poses": _of_poses(summary),
         "track": _of_track(summary),
         "depths": {
             node: {"least_m": min(depths), "most_m": max(depths), "sigma_m": summary.depth_sigma_m[node]}
@@ -80,7 +80,8 @@ def numbers_of(dive: Dive, summary: Summary, outliers: list[Outlier] | None, abo
     }  # fmt: skip
 
 
-def _of_poses(poses: list[RelativePose]) -> dict[str, Any] | None:
+def _of_poses(summary: Summary) -> dict[str, Any] | None:
+    poses, sigmas_px = summary.poses, summary.light_sigmas_px
     if not poses:
         return None
     ranges_m = [pose.range_m for pose in poses]
@@ -90,6 +91,7 @@ def _of_poses(poses: list[RelativePose]) -> dict[str, Any] | None:
         "range_median_m": _median(ranges_m),
         "sigma_median_m": _median([sigma_m(pose) for pose in poses]),
         "range_gap_median_m": _median([abs(pose.range_gap_m) for pose in poses]),
+        "light_sigma_median_px": _median(list(sigmas_px)) if sigmas_px else None,
         "methods": dict(Counter(pose.method for pose in poses)),
         "checks": dict(Counter(check for pose in poses for check in pose.checks)),
     }

@@ -28,15 +28,15 @@ def methods_html(numbers: dict[str, Any], summary: Summary) -> str:
     if not poses:
         return ""
     a, b = numbers["dive"]["pair"]
-    said = []
+    said, noise_px = [], poses["light_sigma_median_px"]
+    located = f", which the other located with a noise of {noise_px:.2g} px (1 sd, stated, median)" if noise_px else ""
     infos = [summary.infos[node][-1] for node in (a, b) if node in summary.infos]
     if len(infos) == 2:
         cameras = " and ".join(f"{info.width_px} x {info.height_px} px ({info.camera.model})" for info in infos)
         bars = " and ".join(f"{math.dist(info.light_left_m, info.light_right_m):.3f} m" for info in infos)
         said.append(
             f"Nodes {a} and {b} took pictures at the same instants, {S_NS / infos[0].trigger_period_ns:g} a second "
-            f"({cameras}). Each carried two lights, {bars} apart, which the other located with a noise of "
-            f"{infos[0].sigma_px:g} px (1 sd, stated)."
+            f"({cameras}). Each carried two lights, {bars} apart{located}."
         )
     said.append(
         f"Of {triggers['total']} triggers, {triggers['with_pose']} ({triggers['with_pose'] / triggers['total']:.1%}) "
@@ -101,7 +101,8 @@ def outliers_html(numbers: dict[str, Any], found: Sequence[Outlier] | None, star
     if told is None:
         return "<p>Not judged: the log holds no track of this pair.</p>"
     said = (
-        f"{told['found']} of {told['judged']} poses are further from the track than 99.9 % of honest ones would be "
+        f"Of the {told['judged']} poses with a track at the same time {told['found']} "
+        f"{'is' if told['found'] == 1 else 'are'} further from it than 99.9 % of honest ones would be "
         f"({math.sqrt(GATE):.1f} sigma of their own covariance)."
     )
     cards = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import Final
@@ -16,7 +17,7 @@ from buddyline.tools.evaluation.tracks import TrackFigures, covered_share, track
 from buddyline.tools.evaluation.truth import TruthTrack, inverted
 from buddyline.tools.monitor.coverage import Coverage
 from buddyline.tools.monitor.outliers import TrackPath
-from buddyline.tools.monitor.panel import judged_picture
+from buddyline.tools.monitor.panel import chosen_lights, judged_picture
 from buddyline.tools.monitor.picture import PairPicture, Point
 from buddyline.tools.pairs import Pair
 
@@ -47,8 +48,8 @@ class Summary:
     points: its poses, tracks: its track; of each only some, spacing_ns apart at least. asked: stamps of the pair's
     frames, ns, by trigger. dark_s: the longest time in which the track used no light. track_coverage: where the track
     covers the dive, None without a track. depths: by node, (ns, m). depth_sigma_m: by node, the gauge's stated one.
-    path: all places of the track. infos: by node, one for each calibration that it had. counts: messages by key, each
-    once, of however many logs.
+    path: all places of the track. light_sigmas_px: stated, of the lights that the poses used. infos: by node, one for
+    each calibration that it had. counts: messages by key, each once, of however many logs.
     """
 
     picture: PairPicture
@@ -65,6 +66,7 @@ class Summary:
     depths: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
     depth_sigma_m: dict[str, float] = field(default_factory=dict)
     path: TrackPath = field(default_factory=TrackPath)
+    light_sigmas_px: array[float] = field(default_factory=lambda: array("d"))
     counts: Counter[str] = field(default_factory=Counter)
     shots: dict[str, JudgedPicture] = field(default_factory=dict)
     infos: dict[str, list[NodeInfo]] = field(default_factory=dict)
@@ -147,6 +149,11 @@ def _take_outcome(summary: Summary, outcome: RelativePose | Rejected, at_ns: int
         return
     summary.coverage.add(at_ns, None, outcome.stamp_ns)
     summary.poses.append(outcome)
+    for name, node in summary.picture.nodes.items():
+        frame = next((one for one in reversed(node.candidates) if one.trigger == outcome.trigger), None)
+        if frame is not None:
+            lights = [k for k in chosen_lights(outcome, name) if 0 <= k < len(frame.blobs)]
+            summary.light_sigmas_px.extend(frame.blobs[k].sigma_px for k in lights)
     _keep(summary, summary.points, outcome, at_ns)
 
 
