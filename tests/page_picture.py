@@ -10,8 +10,8 @@ from buddyline.tools.cli import main
 from tests.processes import REPOSITORY
 from tests.tools.browsed import Processes, chromium_browser, free_port, looking, wait_for_server
 
-# Of the sample's thirty seconds: a path to look at, and all four lights in view.
-SHOWN_AT = "0:24."
+# Of the sample's thirty seconds: a path to look at, both nodes' pictures, and all four lights in view.
+SHOWN_AT = "0:17."
 
 
 def draw() -> None:
