@@ -118,7 +118,7 @@ def refusal(endpoint: str, tls: Tls | None) -> str | None:
             # A hub that refuses sends its alert only after its own side of the handshake is complete.
             link.recv(1)
     except ssl.SSLCertVerificationError as error:
-        words = _VERIFY_WORDS.get(error.verify_message, "was not made by our authority, or another server answers")
+        words = _VERIFY_WORDS.get(error.verify_message, "was not made by our authority, or is another server's")
         return f"the certificate of the hub at {endpoint} {words}"
     except ssl.SSLError as error:
         if tls is None:

@@ -228,7 +228,7 @@ def as_text(
 ) -> str:
     """Return the plan for a person."""
     lines = [
-        f"lights {baseline_m:g} m apart, found to {sigma_px:g} px (1 sd; --sigma-px): RMS errors to expect "
+        f"lights {baseline_m:g} m apart, located to {sigma_px:g} px (1 sd; --sigma-px): RMS errors to expect "
         "(the Cramér-Rao bound; azimuth with the compass)",
         f"{'at, m':>9} {'range, m':>9} {'position, m':>12} {'azimuth, deg':>13} {'rotation, deg':>14}",
     ]

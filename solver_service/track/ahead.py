@@ -15,25 +15,13 @@ from typing import Final
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, skew
 from buddyline.solver_service.track.samples import Samples
-from buddyline.solver_service.track.strapdown import OWN, Carried, Increments, SampleGrid, integrate
+from buddyline.solver_service.track.strapdown import OWN, Carried, Increments, NodesCarried, SampleGrid, integrate
 from numpy.typing import NDArray
 
 # Constants may change by so much before steps are integrated anew: the gyro's bias, the accelerometer's, mount, lever
 # arm, delay. What is neglected is the square of that, and how shaking changes the force within the delay's change.
 TOLERANCES: Final = np.repeat((5e-3, 5e-2, 5e-3, 2e-2, 1e-3), (3, 3, 3, 3, 1))
 _IDENTITY: Final[Floats] = np.eye(3)
-
-
-@dataclass(frozen=True, eq=False)
-class _AtStart:
-    """Nodes (N) in the axes that they have at a step's start, with their units' constants, for `integrate`."""
-
-    R: Floats
-    gyro_bias_radps: Floats
-    accel_bias_mps2: Floats
-    mount_rad: Floats
-    lever_m: Floats
-    delay_s: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +127,8 @@ def steps_ahead(
     rates_radps = each[:, :, 3:6]
     constants = _constants(state)
     gyro, accel, mount, lever, delay = np.split(np.tile(constants, (len(told), 1)), (3, 6, 9, 12), axis=1)
-    start = _AtStart(np.broadcast_to(_IDENTITY, (count, 3, 3)), gyro, accel, mount, lever, delay[:, 0])
+    # Level is here what a node's own axes are at the step's start.
+    start = NodesCarried(np.broadcast_to(_IDENTITY, (count, 3, 3)), gyro, accel, mount, lever, delay[:, 0])
     parts = integrate(start, grid)
     # To correct for lever arm and delay, unlike to estimate them, what the unit itself shakes counts.
     by_change = integrate(start, replace(grid, slow_radps=rates_radps[:, [0, -1]], fast=None)).jacobian[..., 3:]

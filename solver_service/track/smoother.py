@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 # What rows and pictures need of a covariance: of COLUMNS, half.
 _UPPER: Final = np.triu_indices(len(COLUMNS))
 _BLOCK_UPPER: Final = COLUMNS[_UPPER[0]], COLUMNS[_UPPER[1]]
-# Of Q, for both attitudes and the velocity: its variance, that of the shaking, and how one moves the other.
+# The numbers of Q that Path.drawn is made of. For A's attitude, B's attitude and the velocity each: its variance, the
+# variance of what is shaken, and the nine covariances of both.
 _SHAKING: Final = ((PHI[0], SHAKE[0]), (PHI[1], SHAKE[1]), (V_, SHOVE))
 _DRAWN: Final = (
     np.array([(by.start, off.start, *np.repeat(np.r_[by], 3)) for by, off in _SHAKING]),
@@ -196,7 +197,7 @@ def _rows_together(path: Path, times_s: Floats, stamps_ns: Sequence[int]) -> lis
 
 
 def _drawn(noted: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Give Path.drawn and Path.without (N, ...) of what was noted (N, 3, 11) of steps' Q, as _DRAWN picks it."""
+    """Give Path.drawn and Path.without of the numbers (N, 3, 11) that _DRAWN picks out of each step's Q."""
     of = noted[..., :2]
     # Without a unit its shaking is drawn, but moves nothing.
     moved = np.asarray(noted[..., 2:].any(axis=-1))

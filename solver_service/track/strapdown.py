@@ -117,7 +117,7 @@ class Carried(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class NodesCarried:
-    """The same as numbers."""
+    """What nodes (N) start from that are not those of one state."""
 
     R: Floats
     gyro_bias_radps: Floats
@@ -274,13 +274,13 @@ def integrate(state: Carried, grid: SampleGrid) -> Increments:
 
 
 def of_nodes(states: State) -> NodesCarried:
-    """Give what both nodes of pairs (N) start from, each on its own (2 N)."""
+    """Give what the nodes (2 N) of a batch of pairs' states (N) start from."""
     every = (getattr(states, each.name) for each in fields(NodesCarried))
     return NodesCarried(*(each.reshape(-1, *each.shape[2:]) for each in every))
 
 
 def of_pairs(found: Increments) -> Increments:
-    """Give nodes' (2 N) increments as those of pairs (N), with leading axes."""
+    """Give the increments of nodes (2 N) as those of a batch of pairs: each array (N, 2, ...)."""
     told = {name: each for name, each in vars(found).items() if each is not None}
     return replace(found, **{name: each.reshape(-1, 2, *each.shape[1:]) for name, each in told.items()})
 

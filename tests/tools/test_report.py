@@ -155,7 +155,7 @@ def test_an_outlier_is_listed_with_its_pictures(dive: tuple[str, str]) -> None:
     told: dict[str, Any] = numbers_in(page)["outliers"]
     assert (told["judged"], told["found"], told["listed"][0]["trigger"]) == (180, 1, pose(OUTLIER).trigger)
     section = page.split("<h2>Outliers")[1].split("<h2>")[0]
-    assert "Of the 180 poses with a track at the same time 1 is further from it" in section
+    assert "Of the 180 poses with a track at the same time, 1 is further from it" in section
     assert section.count("<svg") == 2
     # The picture of a was recorded; of b there are the candidates alone.
     assert section.count("<image ") == 1

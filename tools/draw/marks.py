@@ -59,7 +59,7 @@ def _mark(marked: NDArray[np.uint8], rank: int, detection: Detection, size: floa
     fine = (round(blob.u_px * 8), round(blob.v_px * 8))
     cv2.circle(marked, fine, max(8, round(3 * blob.sigma_px * 8)), colour, 1, cv2.LINE_AA, 3)
     cv2.drawMarker(marked, (round(blob.u_px), round(blob.v_px)), colour, cv2.MARKER_CROSS, round(16 * size), 1)
-    text = f"{rank}: {score:.2f}, 1 sd {blob.sigma_px:.2g} px"
+    text = f"{rank}: {score:.2f}, 1 sd {blob.sigma_px:.2f} px"
     corner = detection.outline_px.max(axis=0) + 3
     _write(marked, text, (float(corner[0]), float(corner[1])), size, colour)
     if say_why:

@@ -164,7 +164,9 @@ def _figures(numbers: dict[str, Any]) -> str:
         if stats and stats["count"]:
             median, p95 = length_words(stats["median_m"]), length_words(stats["p95_m"])
             rows.append((f"against truth, {name}", f"{median} median, {p95} p95"))
-    said = f"Of the track, samples {track['spacing_s']:g} s apart are counted; evaluate takes all." if track else ""
+    if not track:
+        return table(rows)
+    said = f"The track's figures are of one sample in {track['spacing_s']:g} s; buddyline evaluate takes all samples."
     return table(rows) + f'<p class="dim">{said}</p>'
 
 

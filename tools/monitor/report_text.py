@@ -101,7 +101,7 @@ def outliers_html(numbers: dict[str, Any], found: Sequence[Outlier] | None, star
     if told is None:
         return "<p>Not judged: the log holds no track of this pair.</p>"
     said = (
-        f"Of the {told['judged']} poses with a track at the same time {told['found']} "
+        f"Of the {told['judged']} poses with a track at the same time, {told['found']} "
         f"{'is' if told['found'] == 1 else 'are'} further from it than 99.9 % of honest ones would be "
         f"({math.sqrt(GATE):.1f} sigma of their own covariance)."
     )
