@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 from buddyline.solver_service.geometry.compasses import Contradiction, HeadingGap
 from buddyline.solver_service.geometry.observation import Reason
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.geometry.se3 import SE3
+
+# Beyond it two lamps are as good as one in any picture.
+MOST_TOLD_M: Final = 999.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +50,11 @@ class Fix:
     def q_a_b_xyzw(self) -> Floats:
         """How B's camera is turned (4,), from its frame to A's."""
         return self.T_a_b.q_xyzw
+
+
+def in_metres(range_m: float) -> str:
+    """Say a range; one that no picture can tell from any other as no more than that."""
+    return f"{range_m:.3g} m" if range_m < MOST_TOLD_M else "1000 m or more"
 
 
 @dataclass(frozen=True)

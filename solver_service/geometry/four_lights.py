@@ -18,6 +18,7 @@ from buddyline.solver_service.geometry.evidence import (
     log_gaps,
     weigh,
 )
+from buddyline.solver_service.geometry.fix import in_metres
 from buddyline.solver_service.geometry.observation import Reason
 from buddyline.solver_service.geometry.quads import Quads, find_quads
 from buddyline.solver_service.geometry.ragged import largest, rank, starts_of
@@ -116,7 +117,7 @@ def _why_none(batch: Batch, trigger: int, near: bool, range2: Floats) -> tuple[R
     if not min(pairs_a, pairs_b):
         return "out_of_range", f"no two candidates stand as far apart as the lights would {batch.range_limits}"
     if len(range2):
-        return "out_of_range", f"what agrees, at {math.sqrt(range2[0]):.3g} m, is not {batch.range_limits}"
+        return "out_of_range", f"what agrees, at {in_metres(math.sqrt(range2[0]))}, is not {batch.range_limits}"
     combinations = f"{pairs_a} pairs in A's picture and {pairs_b} in B's"
     if near or "range" not in batch.settings.checks:
         return "twist_gap", f"no two of {combinations} have the same twist where their ranges agree"

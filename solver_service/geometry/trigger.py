@@ -17,7 +17,7 @@ from buddyline.solver_service.geometry.batch import Batch
 from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.compasses import Contradiction, HeadingGap, compare_headings
 from buddyline.solver_service.geometry.evidence import AGREES, CHANCE_ODDS, POOR_FIT, UNFIT_CHI2
-from buddyline.solver_service.geometry.fix import Fix, NoFix
+from buddyline.solver_service.geometry.fix import Fix, NoFix, in_metres
 from buddyline.solver_service.geometry.four_lights import FourLights, read_four_lights
 from buddyline.solver_service.geometry.observation import (
     Heading,
@@ -160,7 +160,7 @@ class _Batched:
             return NoFix("degenerate", "the directions do not determine a pose")
         range_m = math.hypot(*t[k].tolist())
         if not settings.range_min_m <= range_m <= settings.range_max_m:
-            return NoFix("out_of_range", f"what agrees, at {range_m:.3g} m, is not {self.batch.range_limits}")
+            return NoFix("out_of_range", f"what agrees, at {in_metres(range_m)}, is not {self.batch.range_limits}")
         same = _like(weighed, k, range_m)
         ratio = agreeing = math.exp(weighed.log_ratio[k])
         if len(weighed) > 1:
@@ -175,7 +175,7 @@ class _Batched:
         sigma_m = math.sqrt(widened * float(weighed.covariance[k, :3, :3].trace()))
         unsure = sigma_m > _SURE_POSITION * range_m
         if short and unsure:
-            return NoFix("ambiguous", f"three lights give {range_m:.3g} m to {sigma_m:.2g} m only")
+            return NoFix("ambiguous", f"three lights give {in_metres(range_m)} to {sigma_m:.2g} m only")
         # A false candidate in a light's place is off by as much as the covariance has been widened for.
         false_light = ratio * float(readings.lone_odds[place]) * math.exp(-float(weighed.log_past[k]))
         # What is widened for a gross error may as well be wrong by more: the lights do not fit each other.
@@ -193,7 +193,7 @@ class _Batched:
             against = self._against_headings(trigger, weighed, k, covariance, learned)
             if against is not None and against.contradicts:
                 off_deg = math.degrees(abs(against.gap_rad))
-                what = f"what agrees, at {range_m:.3g} m, is {off_deg:.0f} deg off both headings:"
+                what = f"what agrees, at {in_metres(range_m)}, is {off_deg:.0f} deg off both headings:"
                 if not against.explicable:
                     return NoFix("other_lights", f"{what} a third's bar, seen by both")
                 why = "a third's bar, seen by both, or a compass that the motion has not yet shown to be off"
@@ -202,7 +202,7 @@ class _Batched:
                 )
             return self._fix(trigger, weighed, k, covariance, probability, against)
         tilt_chi2, depth_chi2 = float(readings.tilt_chi2[place]), float(readings.depth_chi2[place])
-        what = f"the best of the hypotheses, at {range_m:.3g} m,"
+        what = f"the best of the hypotheses, at {in_metres(range_m)},"
         if tilt_chi2 > AGREES:
             return NoFix("attitude", f"{what} is {math.sqrt(tilt_chi2):.1f} sigma off the attitudes")
         if depth_chi2 > AGREES:
@@ -213,7 +213,7 @@ class _Batched:
         rivals = np.where(same, -np.inf, weighed.log_ratio)
         rival = int(rivals.argmax())
         if rivals[rival] > weighed.log_ratio[k] - _RIVAL:
-            why = f"another stands at {math.hypot(*t[rival].tolist()):.3g} m"
+            why = f"another stands at {in_metres(math.hypot(*t[rival].tolist()))}"
         return NoFix("ambiguous", f"{what} is {_too_unlikely(probability, required)}: {why} (chi2 {chi2:.1f})")
 
     def _against_headings(
@@ -302,7 +302,7 @@ def _why_unfit(weighed: Weighed, k: int, why: str) -> tuple[Reason, str]:
     range_a_m, range_b_m = readings.range_m[place].tolist()
     in_range = abs(math.log(range_a_m / range_b_m)) > abs(float(readings.twist_gap_rad[place]))
     range_m, chi2 = math.hypot(*weighed.T_a_b.t_m[k].tolist()), float(weighed.chi2[k])
-    what = f"the best of the hypotheses, at {range_m:.3g} m, does not fit its lights (chi2 {chi2:.1f}): {why}"
+    what = f"the best of the hypotheses, at {in_metres(range_m)}, does not fit its lights (chi2 {chi2:.1f}): {why}"
     return "range_gap" if in_range else "twist_gap", what
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from buddyline.solver_service.geometry.camera import Camera
+from buddyline.solver_service.geometry.fix import in_metres
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from buddyline.solver_service.geometry.se3 import SE3
@@ -420,3 +421,10 @@ def test_lights_that_do_not_fit_each_other_give_no_pose(shift_px, reason):
         found = solve(scene, (off, b)) if sensed is None else solve(scene, (off, b), sensed)
         assert isinstance(found, NoFix)
         assert found.reason == reason
+
+
+@pytest.mark.parametrize(
+    ("range_m", "words"), [(4.2137, "4.21 m"), (999.4, "999 m"), (999.6, "1000 m or more"), (5.38e12, "1000 m or more")]
+)
+def test_a_range_reads_as_metres_however_far_it_is(range_m, words):
+    assert in_metres(range_m) == words
