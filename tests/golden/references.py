@@ -32,8 +32,9 @@ Compare = Callable[[Record, Record, bool], list[str]]
 def made_with() -> dict[str, str]:
     """Return what the last digits of a result depend on, beside our own code.
 
-    products: of how numpy's linear algebra adds up the terms of a product, which is another way on processors of other
-    years. A sample of a picture is taken at a 32nd of a pixel: the last digit of a place may move it by a grey level.
+    products: a checksum of some matrix products. numpy's linear algebra adds up their terms in an order that depends on
+    the processor. The detector samples pictures at 32nds of a pixel, so the last bit of a place may change a sample by
+    a grey level.
     """
     terms = np.sqrt(np.arange(7200.0)).reshape(150, 48)
     sums = [rows @ columns for rows in (terms, terms.astype(np.float32)) for columns in (rows[:10].T, rows[0])]

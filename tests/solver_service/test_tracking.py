@@ -148,7 +148,7 @@ def test_a_track_begins_with_the_first_pose_however_many_messages_come_at_once()
     assert found[0].stamp_ns <= first_ns + S_NS // 20
     assert [one.stamp_ns for one in found] == [one.stamp_ns for one in expected]
     for one, other in zip(found, expected, strict=True):
-        # Poses that are solved together differ from single ones in their last digits, by the processor's kind.
+        # On some processors, triggers that are solved together give other last digits than single ones.
         sigma_m = np.sqrt(np.diag(np.reshape(one.covariance, (6, 6)))[:3])
         assert np.abs(np.subtract(one.t_a_b_m, other.t_a_b_m)).max() < 1e-4 * sigma_m.min()
 
