@@ -10,7 +10,7 @@ from buddyline.solver_service.geometry.observation import Reason
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.geometry.se3 import SE3
 
-# Beyond it two lamps are as good as one in any picture.
+# No picture tells ranges beyond this from each other. Rounded to three digits it is the last one below 1000 m.
 MOST_TOLD_M: Final = 999.5
 
 
@@ -53,7 +53,7 @@ class Fix:
 
 
 def in_metres(range_m: float) -> str:
-    """Say a range; one that no picture can tell from any other as no more than that."""
+    """Return a range in words. The words give no digits of a range beyond MOST_TOLD_M."""
     return f"{range_m:.3g} m" if range_m < MOST_TOLD_M else "1000 m or more"
 
 
