@@ -213,6 +213,11 @@ class NodeStream:
                 end_ns = min(end_ns, newest_ns)
         return end_ns
 
+    @property
+    def heard_ns(self) -> int:
+        """Return the newest stamp of all its messages, -1 where there is none."""
+        return max(self.newest_ns or -1, _newest_ns(self.imu), _newest_ns(self.attitude), _newest_ns(self.depth))
+
     def _has_stopped(self, sensor: Sensor) -> bool:
         """Return whether a sensor has been without samples for three seconds, or for one second after a live start.
 

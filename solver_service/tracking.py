@@ -42,6 +42,7 @@ from buddyline.solver_service.track.foresight import ForeseenLight, Foresight, f
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, TrackNode
 from buddyline.solver_service.track.lag import EVERY_S, KEPT_S, TrackLag
 from buddyline.solver_service.track.lamps import UNSEEN_PICTURES, UNSEEN_S
+from buddyline.solver_service.track.moving import HOLD_S
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.problems import ENDED_S, as_ended
 from buddyline.solver_service.track.records import NodeRecord, feed, joined
@@ -301,7 +302,9 @@ class PairTracker:
 
         The smooth track's messages are made as they are read, for they take more memory than all they are made from.
         """
-        return self._end(self._settled_ns + S_NS)
+        # A row after the last message would only be guessed.
+        heard_ns = max(stream.heard_ns for stream in self._streams) + round(2.0 * HOLD_S * S_NS)
+        return self._end(min(self._settled_ns + S_NS, heard_ns))
 
     def _end(self, end_ns: int) -> Iterable[Message]:
         """Take what is left up to end_ns, and tell what the end of a track tells."""

@@ -59,6 +59,10 @@ LOST_RANGE_M: Final = 10.0
 IRON_RAD: Final = np.radians((1.0, 1.0, 8.0))
 # A fix contradicts beyond this chi^2 of 6 degrees of freedom, an attitude beyond it of 3: chances of 1e-5 and 3e-7.
 CONTRADICTS: Final = 33.0
+# So do several fixes on end whose chi^2, each counted by a third, has this mean: that of a sound track is 1 to 2, for a
+# fix is made of lights that the track has used too, and a track whose first updates were wrong stays within 33 long.
+CONTRADICT: Final = 10.0
+LASTING: Final = 0.7
 REFUSED_TO_SAY: Final = 10
 # With clocks further apart than this, and by so many sigmas, the live filter is far from linear and its covariance too
 # small: it gives no rows until APART_S later.
@@ -216,7 +220,9 @@ class TrackFilter(TrackPool):
         self._fix_s = t_s
         agreed = False
         for estimate in self._estimates():
-            if self._agrees(estimate, t_s, fix):
+            chi2 = self._gap_chi2(estimate, t_s, fix)
+            estimate.gap_chi2 += (1.0 - LASTING) * (min(chi2, CONTRADICTS) - estimate.gap_chi2)
+            if chi2 < CONTRADICTS and estimate.gap_chi2 < CONTRADICT:
                 agreed = True
                 estimate.agreed_s = t_s
                 estimate.agreed += 1
@@ -237,14 +243,15 @@ class TrackFilter(TrackPool):
             self.challengers.append(started)
             self.challengers = self.challengers[-3:]
 
-    def _agrees(self, estimate: Estimate, t_s: float, fix: FixSeen) -> bool:
+    def _gap_chi2(self, estimate: Estimate, t_s: float, fix: FixSeen) -> float:
+        """Give chi^2 of what a fix is off an estimate."""
         state, P = self._predict(estimate, t_s)
         now = at_one_time(state, estimate.rates_radps)
         J = (pose_jacobian(now) @ at_one_time_jacobian(state, estimate.rates_radps))[:6]
         toward = now.R[0].T
         gap = np.concatenate((fix.t_a_b_m - toward @ now.r_m, rotation_log(fix.R_a_b @ (toward @ now.R[1]).T)))
         S = J @ P[BLOCK] @ J.T + fix.covariance + np.diag([1e-4] * 3 + [1e-5] * 3)
-        return float(gap @ np.linalg.solve(S, gap)) < CONTRADICTS
+        return float(gap @ np.linalg.solve(S, gap))
 
     def _start(self, t_s: float, fix: FixSeen) -> Estimate | None:
         attitudes = [newest_before(of_node, t_s + HOLD_S) for of_node in self.attitudes]

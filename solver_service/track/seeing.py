@@ -92,9 +92,11 @@ class TrackSights(TrackMoves):
         camera = self.nodes[observer].rig.camera
         X, y, H = self._compared(sight, estimate.state, estimate.rates_radps, sight.t_s - estimate.t_s)
         exact = sight
-        # Starts are weighed by their evidence: one that doubts its own clock must not explain more with it.
+        # Starts are weighed by their evidence: one that doubts its own clock must not explain more with it. Without
+        # units a start would drift off by the guessed motion before it has learned its velocity.
+        widened = sight if not estimate.confirmed and any(estimate.without) else _widened(sight, H, estimate.covariance)
         if estimate.confirmed:
-            sight = _widened(sight, H, estimate.covariance)
+            sight = widened
         detection = estimate.detection[observer]
         place = place_covariance(estimate.state, estimate.covariance)
         share = math.sqrt(place.trace()) / float(np.linalg.norm(estimate.state.r_m))
@@ -127,7 +129,9 @@ class TrackSights(TrackMoves):
         estimate.last_seen = found.seen if all(inside) and not wide else None
         learn_detection(estimate.detection[observer], inside, found.seen)
         if found.chosen:
-            self._update_lights(estimate, found, y, H, sight)
+            more = widened.sigma_px**2 - sight.sigma_px**2
+            told = tuple((k, light, variance + float(more[k])) for k, light, variance in found.chosen)
+            self._update_lights(estimate, replace(found, chosen=told), y, H, sight)
             if not estimate.confirmed:
                 estimate.used[observer, sight.stamp_ns] = found.chosen
             if estimate.unseen_by == observer:

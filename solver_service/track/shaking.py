@@ -20,8 +20,8 @@ from buddyline.solver_service.track.state import MOVING, PHI, R_, SHAKE, SHOVE, 
 SHAKEN_S: Final = 0.1
 # Before the dive tells: between a unit that is screwed to its camera and one in a loose housing, 1 sd. It counts as
 # much as FIRST residuals.
-SHAKE_RAD: Final = 5e-4
-SHOVE_MPS: Final = 5e-3
+SHAKE_RAD: Final = 1e-3
+SHOVE_MPS: Final = 1e-2
 FIRST: Final = 0.5
 LEAST: Final = np.log(np.array((5e-5, 5e-5, 5e-4)) ** 2)
 MOST: Final = np.log(np.array((0.03, 0.03, 0.3)) ** 2)

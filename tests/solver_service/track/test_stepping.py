@@ -13,14 +13,16 @@ import numpy as np
 import pytest
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
 from buddyline.solver_service.track import seeing
+from buddyline.solver_service.track.association import associate
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.lights import COLUMNS, Sight, light_positions, residuals, sight_of
 from buddyline.solver_service.track.moving import HOLD_S, KNOWN_CLOCK_S
 from buddyline.solver_service.track.records import last_ns
-from buddyline.solver_service.track.seeing import _widened
+from buddyline.solver_service.track.seeing import _widened, light_rows
 from buddyline.solver_service.track.state import CLOCK, MOVING, PHI, R_, SIZE, V_, State
 from buddyline.solver_service.track.strapdown import Noise
+from buddyline.solver_service.track.trail import Chosen
 from buddyline.solver_service.track.walking import Walking
 
 from tests.solver_service.track.dives import Setting, filter_of, make
@@ -68,25 +70,36 @@ def test_a_picture_of_a_counts_the_product_of_clock_and_velocity_errors() -> Non
     assert _widened(of_b, H, P) is of_b
 
 
-def test_a_start_does_not_doubt_its_clock_and_a_confirmed_track_does(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_start_is_weighed_without_the_doubt_of_its_clock_and_moved_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With it a start would explain more than one that believes its clock; without it, it would believe a wrong one."""
     dive = make(1, Setting(seconds=3.0))
     track = filter_of(dive.records, dive.fixes)
-    confirmed = []
+    weighed: list[tuple[bool, float]] = []
+    moved: list[tuple[bool, float]] = []
 
-    def noted(sight: Sight, H: Floats, P: Floats) -> Sight:
+    def confirmed() -> bool:
         assert track.main is not None
-        confirmed.append(track.main.confirmed)
-        return _widened(sight, H, P)
+        return track.main.confirmed
 
-    monkeypatch.setattr(seeing, "_widened", noted)
+    def noted_weighing(y: Floats, H: Floats, P: Floats, sigma_px: Floats, detection: Floats, clutter: float) -> object:
+        weighed.append((confirmed(), float(sigma_px.max(initial=Setting().sigma_px))))
+        return associate(y, H, P, sigma_px, detection, clutter)
+
+    def noted_moving(chosen: Chosen, y: Floats, H: Floats) -> object:
+        moved.append((confirmed(), max(variance for _, _, variance in chosen) ** 0.5))
+        return light_rows(chosen, y, H)
+
+    monkeypatch.setattr(seeing, "associate", noted_weighing)
+    monkeypatch.setattr(seeing, "light_rows", noted_moving)
     frames = sorted(frame.stamp_ns for record in dive.records for frame in record.frames)
     track.advance(frames[4])
     assert track.main is not None
     assert track.main.told_by != [0, 0]
     assert not track.main.confirmed
     track.advance(frames[-1])
-    assert len(confirmed) > 20
-    assert all(confirmed)
+    assert {sigma_px for known, sigma_px in weighed if not known} == {Setting().sigma_px}
+    assert max(sigma_px for known, sigma_px in moved if not known) > 1.2 * Setting().sigma_px
+    assert max(sigma_px for known, sigma_px in weighed if known) > 1.01 * Setting().sigma_px
 
 
 def test_a_walk_is_learned_only_once_the_clock_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
