@@ -19,6 +19,8 @@ from buddyline.solver_service.geometry.sensors import off_rad
 
 # Nobody knows a moving diver to less than a millimetre and a milliradian.
 _LEAST_KNOWN: Final = 1e-6 * np.eye(6)
+# So large a variance of ln range tells nothing; a larger one would only spoil the inverse.
+_UNKNOWN: Final = 1e6
 # A prediction from earlier fixes is wrong this often. Where it is right, the predicted pose gains this much at most
 # (log), and a pose beside it less: with one bound for all poses near it, a false light close to the right one would
 # gain as much as the right one.
@@ -69,12 +71,15 @@ class Prediction:
 
     @staticmethod
     def of(prior: Prior, bearing_variance: float, rigs: RigPair, settings: Settings) -> Prediction:
-        """Take a prediction; bearing_variance: rad^2, by which a pose found there scatters on top of it."""
+        """Take a prediction; bearing_variance: rad^2, by which a pose found there scatters on top of it.
+
+        Raises ArithmeticError where absurd values, such as lights 1e150 m apart, leave no finite information.
+        """
         t = prior.T_a_b.t_m
         range2 = float(t @ t) + 1e-6
         sight = t[:, None] * t / range2
         # Of ln range and of the twist, by both pictures.
-        relative = bearing_variance * range2 * rigs.gap_per_bearing_m2
+        relative = min(bearing_variance * range2 * rigs.gap_per_bearing_m2, _UNKNOWN)
         total = prior.covariance + _LEAST_KNOWN
         total[:3, :3] += relative * range2 * sight
         total[3:, 3:] += relative * sight
@@ -83,6 +88,8 @@ class Prediction:
         log_chance = -math.log(range2**1.5 * spread * rigs.views_sr2 * 2.0 * math.pi)
         log_area = 0.5 * float(np.linalg.slogdet(total)[1]) + 3.0 * math.log(2.0 * math.pi)
         information: Floats = np.asarray(np.linalg.inv(total), dtype=np.float64)
+        if not np.isfinite(information).all():
+            raise ArithmeticError("what earlier poses tell is not finite")
         log_gain = min(-log_area - log_chance, _MAX_LOG_PRIOR)
         sigma_m = math.sqrt(float(np.trace(total[:3, :3])))
         reach_m = (_REACH_MPS + _REACH_RADPS * math.sqrt(range2)) * prior.since_s + 4.0 * sigma_m

@@ -22,7 +22,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Message, NodePose
 from buddyline.protocol.topics import key_of
 from buddyline.tools.monitor.coverage import Coverage
-from buddyline.tools.monitor.frames import PageContents, Viewer, fields, scene
+from buddyline.tools.monitor.frames import PageContents, Viewer, fields, numbers, scene
 from buddyline.tools.monitor.live import LiveSession
 from buddyline.tools.monitor.overview import Overview
 from buddyline.tools.monitor.playback import Playback, cover
@@ -276,6 +276,9 @@ class TestFrames:
                 if getattr(message, "node", "") == "b":
                     take(overview, replace(message, node="c"), at(k))
         assert "all nodes send" in Viewer(live=False).frame(overview, at(29))["banner"]["text"]
+
+    def test_an_integer_that_no_float_holds_is_no_number_to_plot(self) -> None:
+        assert numbers({"seq": 10**400, "trigger": -(10**400), "gain": 2}) == {"gain": 2.0}
 
     def test_any_number_of_any_message_can_be_plotted(self) -> None:
         overview, viewer = filled(), Viewer(live=True)

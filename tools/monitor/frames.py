@@ -7,6 +7,7 @@ plots), `banner`, `figures`, `health`, `cameras` (HTML whose text is escaped), `
 from __future__ import annotations
 
 import math
+import sys
 from typing import Any, Final
 
 import msgspec
@@ -179,7 +180,8 @@ def numbers(value: Any, path: str = "") -> dict[str, float]:
     if isinstance(value, bool):
         return {path: float(value)}
     if isinstance(value, int | float):
-        return {path: float(value)}
+        # JSON has integers that no float can hold.
+        return {} if abs(value) > sys.float_info.max else {path: float(value)}
     if isinstance(value, dict):
         parts = [(f"{path}.{name}" if path else str(name), part) for name, part in value.items()]
     elif isinstance(value, list | tuple):
