@@ -59,12 +59,12 @@ class TrackDive:
 
     @property
     def shares(self) -> tuple[float, float, float]:
-        """Median, 95th percentile and largest error of the track as shares of the poses'."""
+        """Median, 95th percentile and largest error of the track as shares of the poses', NaN where there is none."""
         ours, theirs = self.figures, self.poses_m
         return (
             (ours.position_m.median or 0.0) / (theirs.median or np.nan),
             (ours.position_m.p95 or 0.0) / (theirs.p95 or np.nan),
-            (ours.worst_m or 0.0) / self.worst_pose_m,
+            (ours.worst_m or 0.0) / (self.worst_pose_m or np.nan),
         )
 
     def __str__(self) -> str:
@@ -152,7 +152,7 @@ def main() -> int:
             print(f"{seed} {dive}", flush=True)
     bad = False
     for mode, found in dives.items():
-        middle, most, worst = np.median([dive.shares for dive in found], axis=0)
+        middle, most, worst = np.nanmedian([dive.shares for dive in found], axis=0)
         nees = [(dive.figures.nees6.mean or 0.0) / 6.0 for dive in found]
         wrong, samples = (sum(getattr(dive.figures, name) for dive in found) for name in ("wrong", "samples"))
         in_gaps = sum(dive.figures.wrong_in_gaps for dive in found)
