@@ -71,9 +71,14 @@ class TrackDive:
         of, (middle, most, worst) = self.figures, self.shares
         return (
             f"{of.mode:6} {1e3 * (of.position_m.median or 0.0):6.1f} mm, share of the poses' errors {middle:.2f} "
-            f"{most:.2f} {worst:.2f}, covered {of.covered or 0.0:6.1%}, NEES/6 {(of.nees6.mean or 0.0) / 6.0:.2f}, "
+            f"{most:.2f} {worst:.2f}, covered {covered(of):6.1%}, NEES/6 {(of.nees6.mean or 0.0) / 6.0:.2f}, "
             f"wrong {of.wrong} of {of.samples}" + (f", dark {1e3 * self.dark_m:.0f} mm" if self.dark_m else "")
         )
+
+
+def covered(figures: TrackFigures) -> float:
+    """Return the share of the time between first and last pose that is covered, NaN where no two poses were."""
+    return np.nan if figures.covered is None else figures.covered
 
 
 def told(world: World, args: argparse.Namespace) -> Iterator[Message]:
@@ -152,7 +157,8 @@ def main() -> int:
             print(f"{seed} {dive}", flush=True)
     bad = False
     for mode, found in dives.items():
-        middle, most, worst = np.nanmedian([dive.shares for dive in found], axis=0)
+        shares = np.array([dive.shares for dive in found if dive.worst_pose_m])
+        middle, most, worst = np.median(shares, axis=0) if len(shares) else (np.nan,) * 3
         nees = [(dive.figures.nees6.mean or 0.0) / 6.0 for dive in found]
         wrong, samples = (sum(getattr(dive.figures, name) for dive in found) for name in ("wrong", "samples"))
         in_gaps = sum(dive.figures.wrong_in_gaps for dive in found)
@@ -160,7 +166,7 @@ def main() -> int:
         print(
             f"{mode}, {len(found)} of {len(args.seeds)} dives: shares, median of the dives' {middle:.2f} {most:.2f} "
             f"{worst:.2f}; median {1e3 * np.median([dive.figures.position_m.median for dive in found]):.1f} mm; "
-            f"covered at least {min(dive.figures.covered or 0.0 for dive in found):.1%}; "
+            f"covered at least {min(covered(dive.figures) for dive in found):.1%}; "
             f"NEES/6 {np.mean(nees):.2f} ({min(nees):.2f} to {max(nees):.2f}); "
             f"wrong {wrong} of {samples}, {in_gaps} in gaps; "
             f"dark at most {1e3 * max(dive.dark_m for dive in found):.0f} mm"

@@ -92,9 +92,11 @@ class TrackSights(TrackMoves):
         camera = self.nodes[observer].rig.camera
         X, y, H = self._compared(sight, estimate.state, estimate.rates_radps, sight.t_s - estimate.t_s)
         exact = sight
-        # Starts are weighed by their evidence: one that doubts its own clock must not explain more with it. Without
-        # units a start would drift off by the guessed motion before it has learned its velocity.
-        widened = sight if not estimate.confirmed and any(estimate.without) else _widened(sight, H, estimate.covariance)
+        # Starts are weighed by their evidence: one that doubts its own clock must not explain more with it. Only those
+        # from a fix are moved with it: without units a start drifts off by guessed motion before it knows its velocity,
+        # and one that was searched for is replayed once confirmed, and needs its lights' full weight until then.
+        doubts = estimate.confirmed or not (estimate.searched or any(estimate.without))
+        widened = _widened(sight, H, estimate.covariance) if doubts else sight
         if estimate.confirmed:
             sight = widened
         detection = estimate.detection[observer]
