@@ -42,7 +42,9 @@ LONE_SHARE: Final = 0.1
 FIXES_TO_CONFIRM: Final = 2
 FIXES_TO_REPLACE: Final = 3
 # So many fixes on end that contradict a track, and so many of those that agreed, are enough for it not to be told live.
+# It is said once FIXES_TO_SAY do: a start that is put right within half a second is no news.
 FIXES_TO_DOUBT: Final = 2
+FIXES_TO_SAY: Final = 5
 SHARE_TO_DOUBT: Final = 0.2
 # A start without a fix can drift in range, with too small a covariance, while it follows single lights. Live, it is not
 # told after LONE_S of them, until BARS_TO_FOLLOW pictures have shown both lights or a fix has agreed.
@@ -172,7 +174,7 @@ class TrackFilter(TrackPool):
         contradicted = lately and main.contradicted >= max(FIXES_TO_DOUBT, SHARE_TO_DOUBT * main.agreed)
         if apart:
             self._problems.report(f"{self.both}: their clocks are far apart: no live track", main.t_s)
-        if contradicted:
+        if contradicted and main.contradicted >= FIXES_TO_SAY:
             self._problems.report(f"{self.both}: poses contradict the live track", main.t_s)
         lone = self._lone(main)
         if lone:
