@@ -19,8 +19,8 @@ from buddyline.solver_service.geometry.sensors import off_rad
 
 # Nobody knows a moving diver to less than a millimetre and a milliradian.
 _LEAST_KNOWN: Final = 1e-6 * np.eye(6)
-# So large a variance of ln range tells nothing; a larger one would only spoil the inverse.
-_UNKNOWN: Final = 1e6
+# So large a variance of ln range, and of the twist (rad^2), tells nothing; a larger one would only spoil the inverse.
+_UNKNOWN: Final = 1e4
 # A prediction from earlier fixes is wrong this often. Where it is right, the predicted pose gains this much at most
 # (log), and a pose beside it less: with one bound for all poses near it, a false light close to the right one would
 # gain as much as the right one.
@@ -73,7 +73,7 @@ class Prediction:
     def of(prior: Prior, bearing_variance: float, rigs: RigPair, settings: Settings) -> Prediction:
         """Take a prediction; bearing_variance: rad^2, by which a pose found there scatters on top of it.
 
-        Raises ArithmeticError where absurd values, such as lights 1e150 m apart, leave no finite information.
+        Raises ArithmeticError or LinAlgError where values that are not numbers leave no finite information.
         """
         t = prior.T_a_b.t_m
         range2 = float(t @ t) + 1e-6

@@ -42,7 +42,7 @@ class Estimate:
     How well it fits: evidence: log odds over clutter; evidence_by: of each node's pictures. baseline: the main
     estimate's at the start. surprise, told: chi^2 of the lights used, and of how many residuals. agreed_s: when a fix
     last agreed with it, inf where none did; agreed: how many did; contradicted: how many since then did not;
-    gap_chi2: the mean chi^2 of the last fixes' gaps.
+    gap_chi2: the running mean of the fixes' chi^2.
 
     Its life: searched: it started without a fix; lone: from single lamps. skip_s: pictures within this after start_s
     made it, and tell nothing new. patience_s: how long it may stay unconfirmed. end_s: later pictures are not its own.

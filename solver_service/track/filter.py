@@ -42,7 +42,7 @@ LONE_SHARE: Final = 0.1
 FIXES_TO_CONFIRM: Final = 2
 FIXES_TO_REPLACE: Final = 3
 # So many fixes on end that contradict a track, and so many of those that agreed, are enough for it not to be told live.
-# It is said once FIXES_TO_SAY do: a start that is put right within half a second is no news.
+# The status says so from FIXES_TO_SAY on: a start is often put right within half a second.
 FIXES_TO_DOUBT: Final = 2
 FIXES_TO_SAY: Final = 5
 SHARE_TO_DOUBT: Final = 0.2
@@ -61,10 +61,11 @@ LOST_RANGE_M: Final = 10.0
 IRON_RAD: Final = np.radians((1.0, 1.0, 8.0))
 # A fix contradicts beyond this chi^2 of 6 degrees of freedom, an attitude beyond it of 3: chances of 1e-5 and 3e-7.
 CONTRADICTS: Final = 33.0
-# So do several fixes on end whose chi^2, each counted by a third, has this mean: that of a sound track is 1 to 2, for a
-# fix is made of lights that the track has used too, and a track whose first updates were wrong stays within 33 long.
-CONTRADICT: Final = 10.0
-LASTING: Final = 0.7
+# So do fixes on end whose chi^2 has a running mean above this (the newest counts 0.3). A sound track has 1 to 2, for
+# a fix is made of lights that the track has used; one with wrong first updates can stay below 33 for long. Fixes that
+# contradict by themselves do not count: a sound one after them must agree.
+MEAN_CONTRADICTS: Final = 10.0
+MEAN_KEPT: Final = 0.7
 REFUSED_TO_SAY: Final = 10
 # With clocks further apart than this, and by so many sigmas, the live filter is far from linear and its covariance too
 # small: it gives no rows until APART_S later.
@@ -223,8 +224,9 @@ class TrackFilter(TrackPool):
         agreed = False
         for estimate in self._estimates():
             chi2 = self._gap_chi2(estimate, t_s, fix)
-            estimate.gap_chi2 += (1.0 - LASTING) * (min(chi2, CONTRADICTS) - estimate.gap_chi2)
-            if chi2 < CONTRADICTS and estimate.gap_chi2 < CONTRADICT:
+            if chi2 < CONTRADICTS:
+                estimate.gap_chi2 += (1.0 - MEAN_KEPT) * (chi2 - estimate.gap_chi2)
+            if chi2 < CONTRADICTS and estimate.gap_chi2 < MEAN_CONTRADICTS:
                 agreed = True
                 estimate.agreed_s = t_s
                 estimate.agreed += 1
@@ -246,7 +248,7 @@ class TrackFilter(TrackPool):
             self.challengers = self.challengers[-3:]
 
     def _gap_chi2(self, estimate: Estimate, t_s: float, fix: FixSeen) -> float:
-        """Give chi^2 of what a fix is off an estimate."""
+        """Return chi^2 (of 6) of the difference between a fix and the predicted pose."""
         state, P = self._predict(estimate, t_s)
         now = at_one_time(state, estimate.rates_radps)
         J = (pose_jacobian(now) @ at_one_time_jacobian(state, estimate.rates_radps))[:6]

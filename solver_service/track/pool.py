@@ -110,6 +110,9 @@ class TrackPool(TrackSteps):
             attitude_s=again.attitude_s,
             depth_s=again.depth_s,
             rates_radps=again.rates_radps,
+            # Fixes contradicted what it was before.
+            contradicted=0,
+            gap_chi2=0.0,
         )
 
     def _begun_again(

@@ -92,9 +92,10 @@ class TrackSights(TrackMoves):
         camera = self.nodes[observer].rig.camera
         X, y, H = self._compared(sight, estimate.state, estimate.rates_radps, sight.t_s - estimate.t_s)
         exact = sight
-        # Starts are weighed by their evidence: one that doubts its own clock must not explain more with it. Only those
-        # from a fix are moved with it: without units a start drifts off by guessed motion before it knows its velocity,
-        # and one that was searched for is replayed once confirmed, and needs its lights' full weight until then.
+        # Association and evidence of a start use the plain sigmas, so that starts compete alike. Its update uses the
+        # widened ones, but only of a start from a fix with both units: without units a start drifts off by guessed
+        # motion before it knows its velocity, and one that was searched for is replayed once confirmed, and needs its
+        # lights' full weight until then.
         doubts = estimate.confirmed or not (estimate.searched or any(estimate.without))
         widened = _widened(sight, H, estimate.covariance) if doubts else sight
         if estimate.confirmed:
@@ -132,10 +133,11 @@ class TrackSights(TrackMoves):
         learn_detection(estimate.detection[observer], inside, found.seen)
         if found.chosen:
             more = widened.sigma_px**2 - sight.sigma_px**2
-            told = tuple((k, light, variance + float(more[k])) for k, light, variance in found.chosen)
-            self._update_lights(estimate, replace(found, chosen=told), y, H, sight)
             if not estimate.confirmed:
                 estimate.used[observer, sight.stamp_ns] = found.chosen
+            told = tuple((k, light, variance + float(more[k])) for k, light, variance in found.chosen)
+            found = replace(found, chosen=told)
+            self._update_lights(estimate, found, y, H, sight)
             if estimate.unseen_by == observer:
                 estimate.unseen_by = None
             if len(found.chosen) == 2:

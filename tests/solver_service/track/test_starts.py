@@ -37,7 +37,7 @@ def live(seed: int, grade: InertialGrade | None) -> tuple[list[Track], TrackFigu
 
 @pytest.mark.parametrize(("seed", "grade"), [(22011, "poor"), (22044, "poor"), (22078, "good")])
 def test_a_start_is_not_wrong(seed: int, grade: InertialGrade) -> None:
-    """An outlier among the first lights, a shaken unit, or an unknown clock led these by up to a meter."""
+    """An outlier among the first lights, a shaken unit, or an unknown clock led these astray by up to a metre."""
     _, figures = live(seed, grade)
     assert figures.wrong == 0
     assert figures.nees6.mean is not None
@@ -79,3 +79,15 @@ def test_fixes_that_are_off_for_long_contradict_a_track(sigmas: float, contradic
     track.advance(off[11].stamp_ns)
     assert track.doubted() is contradicted
     assert (said in track.problems) is contradicted
+
+
+def test_gross_fixes_leave_the_sound_one_after_them_agreeing() -> None:
+    """Another diver's bar gave them: each contradicts by itself, and tells nothing of the track."""
+    dive = make(2, Setting(seconds=8.0))
+    gross = [replace(fix, t_a_b_m=2.0 * fix.t_a_b_m) for fix in dive.fixes[12:15]]
+    track = filter_of(dive.records, [*dive.fixes[:12], *gross, *dive.fixes[15:]])
+    track.advance(gross[-1].stamp_ns + 60_000_000)
+    assert track.main is not None
+    assert track.main.contradicted == 3
+    track.advance(dive.fixes[15].stamp_ns + 60_000_000)
+    assert track.main.contradicted == 0
