@@ -302,7 +302,7 @@ class PairTracker:
 
         The smooth track's messages are made as they are read, for they take more memory than all they are made from.
         """
-        # A row after the last message would only be guessed.
+        # Later rows would only be guessed. The filter holds back what is within HOLD_S of the end.
         heard_ns = max(stream.heard_ns for stream in self._streams) + round(2.0 * HOLD_S * S_NS)
         return self._end(min(self._settled_ns + S_NS, heard_ns))
 

@@ -1,15 +1,15 @@
-"""The track's figures on simulated dives: errors as shares of those of the poses, coverage, NEES, and what is wrong.
+"""The track's figures on simulated dives: errors as shares of the poses' errors, coverage, NEES, number of wrong rows.
 
     .venv/bin/python -m tests.track_figures                              # cavern, basin and lake, six seeds, a minute
     .venv/bin/python -m tests.track_figures --inertial good
     .venv/bin/python -m tests.track_figures --inertial none --range 4 8
     .venv/bin/python -m tests.track_figures --dead a.left --modes smooth
     .venv/bin/python -m tests.track_figures --dark 5 --range 4 8         # no light for 5 s in the middle
-    .venv/bin/python -m tests.track_figures --clock-ms 300 --gauge 0.5   # which nobody announced
+    .venv/bin/python -m tests.track_figures --clock-ms 300 --gauge 0.5   # unknown to the solver
 
 Dives go through the whole solver, and are judged as `evaluate` judges them. Each seed has one of the waters. A line for
-each dive and mode, and one for each mode over all; status 1 where more than a thousandth of a mode's samples is wrong.
-A dive of a minute takes some 10 s of CPU.
+each dive and mode, and one for each mode over all. Status 1 where more than a thousandth of a mode's rows are wrong, or
+no dive has a track. A dive of a minute takes some 10 s of CPU.
 """
 
 from __future__ import annotations

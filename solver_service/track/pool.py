@@ -110,7 +110,7 @@ class TrackPool(TrackSteps):
             attitude_s=again.attitude_s,
             depth_s=again.depth_s,
             rates_radps=again.rates_radps,
-            # Fixes contradicted what it was before.
+            # Fixes that contradicted it did so before it was replayed.
             contradicted=0,
             gap_chi2=0.0,
         )

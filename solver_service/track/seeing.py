@@ -92,14 +92,9 @@ class TrackSights(TrackMoves):
         camera = self.nodes[observer].rig.camera
         X, y, H = self._compared(sight, estimate.state, estimate.rates_radps, sight.t_s - estimate.t_s)
         exact = sight
-        # Association and evidence of a start use the plain sigmas, so that starts compete alike. Its update uses the
-        # widened ones, but only of a start from a fix with both units: without units a start drifts off by guessed
-        # motion before it knows its velocity, and one that was searched for is replayed once confirmed, and needs its
-        # lights' full weight until then.
-        doubts = estimate.confirmed or not (estimate.searched or any(estimate.without))
-        widened = _widened(sight, H, estimate.covariance) if doubts else sight
+        # Association and evidence of a start use the plain sigmas, so that all starts compete alike.
         if estimate.confirmed:
-            sight = widened
+            sight = _widened(sight, H, estimate.covariance)
         detection = estimate.detection[observer]
         place = place_covariance(estimate.state, estimate.covariance)
         share = math.sqrt(place.trace()) / float(np.linalg.norm(estimate.state.r_m))
@@ -132,11 +127,9 @@ class TrackSights(TrackMoves):
         estimate.last_seen = found.seen if all(inside) and not wide else None
         learn_detection(estimate.detection[observer], inside, found.seen)
         if found.chosen:
-            more = widened.sigma_px**2 - sight.sigma_px**2
             if not estimate.confirmed:
                 estimate.used[observer, sight.stamp_ns] = found.chosen
-            told = tuple((k, light, variance + float(more[k])) for k, light, variance in found.chosen)
-            found = replace(found, chosen=told)
+                found = replace(found, chosen=_doubted(found.chosen, estimate, sight, H))
             self._update_lights(estimate, found, y, H, sight)
             if estimate.unseen_by == observer:
                 estimate.unseen_by = None
@@ -272,6 +265,18 @@ def light_rows(chosen: Chosen, y: Floats, H: Floats) -> tuple[Floats, Floats, Fl
 def in_front(chosen: Chosen, y: Floats) -> Chosen:
     """Return those candidates of lights that the residuals y (K, 2, 2) have in front of the camera."""
     return tuple(one for one in chosen if np.isfinite(y[one[0], one[1]]).all())
+
+
+def _doubted(chosen: Chosen, start: Estimate, sight: Sight, H: Floats) -> Chosen:
+    """Give a start's lights with the variances that move it: widened, if it began with a fix and has both units.
+
+    Without units a start would drift off by guessed motion before it knows its velocity. One without a fix is replayed
+    once it is confirmed, and needs the full weight of its lights until then.
+    """
+    if start.searched or any(start.without):
+        return chosen
+    more = _widened(sight, H, start.covariance).sigma_px ** 2 - sight.sigma_px**2
+    return tuple((k, light, variance + float(more[k])) for k, light, variance in chosen)
 
 
 def _widened(sight: Sight, H: Floats, P: Floats) -> Sight:

@@ -180,7 +180,7 @@ def numbers(value: Any, path: str = "") -> dict[str, float]:
     if isinstance(value, bool):
         return {path: float(value)}
     if isinstance(value, int | float):
-        # JSON has integers that no float can hold.
+        # JSON has integers that no float can hold; infinity cannot be drawn.
         return {} if abs(value) > sys.float_info.max else {path: float(value)}
     if isinstance(value, dict):
         parts = [(f"{path}.{name}" if path else str(name), part) for name, part in value.items()]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
 from buddyline.solver_service.track import seeing
-from buddyline.solver_service.track.association import associate
+from buddyline.solver_service.track.association import Association, associate
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.lights import COLUMNS, Sight, light_positions, residuals, sight_of
@@ -76,6 +76,7 @@ def test_a_start_is_weighed_without_the_doubt_of_its_clock_and_moved_with_it(mon
     track = filter_of(dive.records, dive.fixes)
     weighed: list[tuple[bool, float]] = []
     moved: list[tuple[bool, float]] = []
+    found: list[Association] = []
 
     def confirmed() -> bool:
         assert track.main is not None
@@ -83,10 +84,12 @@ def test_a_start_is_weighed_without_the_doubt_of_its_clock_and_moved_with_it(mon
 
     def noted_weighing(y: Floats, H: Floats, P: Floats, sigma_px: Floats, detection: Floats, clutter: float) -> object:
         weighed.append((confirmed(), float(sigma_px.max(initial=Setting().sigma_px))))
-        return associate(y, H, P, sigma_px, detection, clutter)
+        found.append(associate(y, H, P, sigma_px, detection, clutter))
+        return found[-1]
 
     def noted_moving(chosen: Chosen, y: Floats, H: Floats) -> object:
-        moved.append((confirmed(), max(variance for _, _, variance in chosen) ** 0.5))
+        more = [after[2] - before[2] for after, before in zip(chosen, found[-1].chosen, strict=True)]
+        moved.append((confirmed(), max(more)))
         return light_rows(chosen, y, H)
 
     monkeypatch.setattr(seeing, "associate", noted_weighing)
@@ -98,7 +101,8 @@ def test_a_start_is_weighed_without_the_doubt_of_its_clock_and_moved_with_it(mon
     assert not track.main.confirmed
     track.advance(frames[-1])
     assert {sigma_px for known, sigma_px in weighed if not known} == {Setting().sigma_px}
-    assert max(sigma_px for known, sigma_px in moved if not known) > 1.2 * Setting().sigma_px
+    assert max(more_px2 for known, more_px2 in moved if not known) > 0.1 * Setting().sigma_px ** 2
+    assert {more_px2 for known, more_px2 in moved if known} == {0.0}
     assert max(sigma_px for known, sigma_px in weighed if known) > 1.01 * Setting().sigma_px
 
 
