@@ -19,6 +19,8 @@ _MIN_RTT_US: Final = (148, "I")
 _ACKED: Final = (120, "Q")
 _RECEIVED: Final = (128, "Q")
 _NOT_SENT: Final = (144, "I")
+_SENT: Final = (200, "Q")
+_SENT_AGAIN: Final = (208, "Q")
 _ESTABLISHED: Final = 1
 # Of Linux; Python's socket module does not have it.
 _TCP_NOTSENT_LOWAT: Final = 25
@@ -28,7 +30,7 @@ class TcpState(NamedTuple):
     """Counts of one connection. acked: bytes that the other end has acknowledged. waiting: bytes not yet sent.
 
     received: bytes that have arrived. unread: of these, bytes that the library has not taken. min_rtt_s: shortest
-    round trip of late.
+    round trip of late. sent: bytes that were sent, each counted once; sent_again: those that were lost.
     """
 
     acked: int
@@ -36,6 +38,8 @@ class TcpState(NamedTuple):
     received: int
     unread: int
     min_rtt_s: float
+    sent: int
+    sent_again: int
 
 
 class Connection:
@@ -76,14 +80,17 @@ class Connection:
             unread = struct.unpack("i", fcntl.ioctl(self._socket, termios.FIONREAD, bytes(4)))[0]
         except (OSError, AttributeError):
             return None
-        if len(info) < _NOT_SENT[0] + 8 or _field(info, _STATE) != _ESTABLISHED:
+        if len(info) < _SENT_AGAIN[0] + 8 or _field(info, _STATE) != _ESTABLISHED:
             return None
+        sent_again = _field(info, _SENT_AGAIN)
         return TcpState(
             acked=_field(info, _ACKED),
             waiting=_field(info, _NOT_SENT),
             received=_field(info, _RECEIVED),
             unread=unread,
             min_rtt_s=_field(info, _MIN_RTT_US) * 1e-6,
+            sent=_field(info, _SENT) - sent_again,
+            sent_again=sent_again,
         )
 
     def cut(self) -> bool:

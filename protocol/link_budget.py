@@ -18,11 +18,20 @@ BEHIND_S: Final = 1.0
 AGAIN_S: Final = 1.0
 LESS: Final = 0.8
 MORE_PER_S: Final = 0.03
+# Before that, what is queued in a modem delays the acknowledgements. By so much, a link is given no more; by twice as
+# much, it is full. The shortest of this time counts.
+QUEUED_S: Final = 0.15
+LEAST_OVER_S: Final = 1.0
+# It is not given more than so many times what is sent on it.
+MOST_PER_OFFERED: Final = 1.25
+# A link with a long round trip may be slow. It begins with little, and is given more much sooner until it is full once.
+FIRST_BYTES_PER_S: Final = 8000.0
+FIRST_MORE_PER_S: Final = 0.3
 # JSON is compressed on the way, how much so is not known: so many bytes of messages are in one that was acknowledged.
 MOST_PER_ACKED: Final = 1.5
 LEAST_PER_ACKED: Final = 0.8
 LEAST_BYTES_PER_S: Final = 1000.0
-# A limit that has left nothing out for so long is lifted.
+# A limit that has left nothing out for so long, and let nothing wait, is lifted.
 LIFT_S: Final = 20.0
 OBSERVED_S: Final = 2.0
 # Of a message besides its payload: headers of Zenoh, TLS, TCP and IP, and the acknowledgement.
@@ -36,6 +45,32 @@ SPARE_SHARE: Final = 0.8
 ANSWER_SHARE: Final = 0.25
 
 
+class AckDelay:
+    """How long after it was sent the other end acknowledges what a connection sends. least_s: None if unknown.
+
+    Where packets were lost meanwhile, the time shows the loss and nothing else: it does not count.
+    """
+
+    def __init__(self) -> None:
+        self.least_s: float | None = None
+        self._last: int | None = None
+        self._sent: deque[tuple[float, TcpState]] = deque()
+        self._delays_s: deque[tuple[float, float]] = deque()
+
+    def observe(self, state: TcpState, now_s: float) -> None:
+        """Take the state of the connection; the times between two calls limit what is known of the delay."""
+        if self._last is not None and state.sent > self._last:
+            self._sent.append((now_s, state))
+        self._last = state.sent
+        while self._sent and self._sent[0][1].sent <= state.acked:
+            sent_s, then = self._sent.popleft()
+            if then.sent_again == state.sent_again:
+                self._delays_s.append((now_s, now_s - sent_s))
+        while self._delays_s and now_s - self._delays_s[0][0] > LEAST_OVER_S:
+            self._delays_s.popleft()
+        self.least_s = min((delay_s for _, delay_s in self._delays_s), default=None)
+
+
 class LinkBudget:
     """Decides which messages a link carries. Without congestion that is all of them. Safe to use from several threads.
 
@@ -47,12 +82,14 @@ class LinkBudget:
         self.shed: Counter[str] = Counter()
         self._lock = threading.Lock()
         self._limit: float | None = None
+        self._more_per_s = MORE_PER_S
         self._tokens = 0.0
         self._answer_tokens = 0.0
         self._tokens_s = 0.0
         self._offered = 0.0
         self._kept_s: dict[str, float] = {}
         self._seen: deque[tuple[float, float, TcpState]] = deque()
+        self._delay = AckDelay()
         self._clear_s = self._full_s = self._reduced_s = self._shed_s = float("-inf")
         # When the other end last acknowledged something while the link was full.
         self._moved_s = float("-inf")
@@ -103,6 +140,7 @@ class LinkBudget:
             if self._limit is not None:
                 self._refill(now_s, self._limit)
                 if self._answer_tokens < 0.0 or self._is_behind(now_s):
+                    self._shed_s = now_s
                     return False
                 self._answer_tokens -= size_bytes + OVERHEAD_BYTES
             self._spend(float(size_bytes + OVERHEAD_BYTES))
@@ -114,16 +152,20 @@ class LinkBudget:
             if self._limit is not None:
                 self._refill(now_s, self._limit)
                 if self._tokens < SPARE_SHARE * self._limit:
+                    self._shed_s = now_s
                     return False
             self._spend(float(size_bytes + OVERHEAD_BYTES))
             return True
 
-    def observe(self, state: TcpState, now_s: float) -> None:
+    def observe(self, state: TcpState, now_s: float, beside: int = 0) -> None:
         """Take the state of the connection, ten times a second; a new connection begins with `forget`.
 
-        A link on which nothing is acknowledged is cut, or waits for a lost packet: nothing is learned from that.
+        beside: bytes that were acknowledged on others which share the link. A link on which nothing is acknowledged is
+        cut, or waits for a lost packet: nothing is learned from that.
         """
         with self._lock:
+            self._delay.observe(state, now_s)
+            state = state._replace(acked=state.acked + beside)
             patience_s = FULL_S + 2.0 * state.min_rtt_s
             moved = bool(self._seen) and state.acked > self._seen[-1][2].acked
             if moved and now_s - max(self._moved_s, self._clear_s) > patience_s:
@@ -140,15 +182,21 @@ class LinkBudget:
             if now_s - self._full_s > FULL_S:
                 if now_s - self._moved_s <= patience_s:
                     self._reduce(now_s)
-            elif self._limit is not None and now_s - self._reduced_s > AGAIN_S and len(self._seen) > 1:
-                self._limit *= 1.0 + MORE_PER_S * (now_s - self._seen[-2][0])
-                if now_s - max(self._shed_s, self._reduced_s) > LIFT_S:
-                    self._limit = None
+            elif self._limit is not None and len(self._seen) > 1:
+                self._adapt(self._limit, now_s)
+
+    def begin_low(self, now_s: float) -> None:
+        """Begin with little on a link with a long round trip, if no limit is known."""
+        with self._lock:
+            if self._limit is None:
+                self._set_limit(FIRST_BYTES_PER_S, now_s)
+                self._more_per_s = FIRST_MORE_PER_S
 
     def forget(self, now_s: float) -> None:
         """Begin anew with another connection; the limit stays."""
         with self._lock:
             self._seen.clear()
+            self._delay = AckDelay()
             self._clear_s = self._full_s = now_s
             self._moved_s = float("-inf")
 
@@ -200,6 +248,24 @@ class LinkBudget:
     def _reserve(self, topic: Topic) -> float:
         return _RESERVES[topic.shed] * (self._limit or 0.0)
 
+    def _adapt(self, limit: float, now_s: float) -> None:
+        """Change the limit of a link on which nothing waits here."""
+        (begin_s, offered, _), (before_s, _, _), (_, _, state) = self._seen[0], self._seen[-2], self._seen[-1]
+        offered_rate = (self._offered - offered) / (now_s - begin_s)
+        # Nothing is known while nothing is sent.
+        queued_s = QUEUED_S if self._delay.least_s is None else self._delay.least_s - state.min_rtt_s
+        since_s = now_s - self._reduced_s
+        if queued_s > QUEUED_S:
+            self._more_per_s = MORE_PER_S
+        if queued_s > 2.0 * QUEUED_S and offered_rate > LESS * limit and since_s > AGAIN_S + 2.0 * state.min_rtt_s:
+            self._set_limit(max(LESS * limit, LEAST_BYTES_PER_S), now_s)
+        elif queued_s < QUEUED_S and since_s > AGAIN_S:
+            # What is sent now is carried; of more nobody knows.
+            most = max(MOST_PER_OFFERED * offered_rate, limit)
+            self._limit = min(max(limit * (1.0 + self._more_per_s * (now_s - before_s)), offered_rate), most)
+        if now_s - max(self._shed_s, self._reduced_s) > LIFT_S:
+            self._limit = None
+
     def _reduce(self, now_s: float) -> None:
         begin_s, offered, state = self._seen[0]
         span_s = now_s - begin_s
@@ -208,9 +274,11 @@ class LinkBudget:
         offered_rate = (self._offered - offered) / span_s
         acked_rate = (self._seen[-1][2].acked - state.acked) / span_s
         limit = max(min(LESS * offered_rate, MOST_PER_ACKED * acked_rate), LEAST_PER_ACKED * acked_rate)
-        if self._limit is not None:
-            limit = min(limit, self._limit)
-        else:
+        self._more_per_s = MORE_PER_S
+        self._set_limit(max(min(limit, self._limit or limit), LEAST_BYTES_PER_S), now_s)
+
+    def _set_limit(self, limit: float, now_s: float) -> None:
+        if self._limit is None:
             self._tokens, self._answer_tokens, self._tokens_s = 0.0, 0.0, now_s
-        self._limit = max(limit, LEAST_BYTES_PER_S)
+        self._limit = limit
         self._reduced_s = now_s

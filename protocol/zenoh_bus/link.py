@@ -9,7 +9,7 @@ import time
 from typing import Final
 
 import zenoh
-from buddyline.protocol.connection import Connection, close_without_wait
+from buddyline.protocol.connection import Connection, TcpState, close_without_wait
 from buddyline.protocol.delivery import CLOSE_S
 from buddyline.protocol.link_budget import LinkBudget
 from buddyline.protocol.zenoh_bus.session import SecondLink
@@ -48,6 +48,12 @@ class Link:
         self._flush = threading.Event()
         self.is_long = False
         self._heard_s = time.monotonic()
+        # Before anything is sent: it may be too much for a long way.
+        with contextlib.suppress(zenoh.ZError):
+            connection = self.connection()
+            if connection is not None:
+                with connection:
+                    self._note_length(connection, connection.state())
         self._thread = threading.Thread(target=self._run, name="bus link", daemon=True)
         self._thread.start()
 
@@ -73,14 +79,13 @@ class Link:
         self._thread.join(CLOSE_S)
 
     def _run(self) -> None:
-        while not self._stop.wait(FIND_S):
-            try:
+        while not self._stop.is_set():
+            with contextlib.suppress(zenoh.ZError):
                 connection = self.connection()
-            except zenoh.ZError:
-                continue
-            if connection is not None:
-                with connection:
-                    self._follow(connection)
+                if connection is not None:
+                    with connection:
+                        self._follow(connection)
+            self._stop.wait(FIND_S)
         self.bulk.close()
 
     def connection(self) -> Connection | None:
@@ -106,10 +111,8 @@ class Link:
             state = connection.state()
             if state is None:
                 return
-            if state.min_rtt_s > LONG_RTT_S and not self.is_long:
-                connection.bear_losses()
-            self.is_long = state.min_rtt_s > LONG_RTT_S
-            self._budget.observe(state._replace(acked=state.acked + self.bulk.acked(now_s)), now_s)
+            self._note_length(connection, state)
+            self._budget.observe(state, now_s, beside=self.bulk.acked(now_s))
             read_before, read = read, state.received - state.unread
             if read != read_before:
                 self._heard_s = now_s
@@ -119,6 +122,13 @@ class Link:
                 log.warning("nobody reads what the hub sends for %.1f s: connecting again", now_s - changed_s)
                 connection.cut()
                 return
+
+    def _note_length(self, connection: Connection, state: TcpState | None) -> None:
+        is_long = state is not None and state.min_rtt_s > LONG_RTT_S
+        if is_long and not self.is_long:
+            connection.bear_losses()
+            self._budget.begin_low(time.monotonic())
+        self.is_long = is_long
 
 
 class Bulk:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 
 import pytest
 from buddyline.protocol import topics
 from buddyline.protocol.connection import TcpState
-from buddyline.protocol.link_budget import ANSWER_SHARE, OVERHEAD_BYTES, LinkBudget
+from buddyline.protocol.link_budget import ANSWER_SHARE, OVERHEAD_BYTES, AckDelay, LinkBudget
 
 STEP_S = 0.01
+RTT_S = 0.4
 SENT = (  # topic, rate (Hz), payload (bytes)
     (topics.CANDIDATES, 5, 1000),
     (topics.CLOCK, 4, 150),
@@ -20,11 +21,20 @@ SENT = (  # topic, rate (Hz), payload (bytes)
 )
 
 
+def state(acked: float, waiting: float, min_rtt_s: float = RTT_S, sent: float | None = None) -> TcpState:
+    """Return what a connection shows. sent: default: no more than is acknowledged."""
+    return TcpState(int(acked), int(waiting), 0, 0, min_rtt_s, int(acked if sent is None else sent), 0)
+
+
 def run(
-    rate_bytes_per_s: float, seconds: float, budget: LinkBudget, start_s: float = 0.0
+    rate_bytes_per_s: float, seconds: float, budget: LinkBudget, start_s: float = 0.0, modem_bytes: float = 0.0
 ) -> tuple[Counter[str], float]:
-    """Send all topics over such a link; return what was sent in the second half, and its longest queue, s."""
-    waiting = acked = longest_s = 0.0
+    """Send all topics over such a link; return what was sent in the second half, and its longest queue, s.
+
+    modem_bytes: what a modem takes ahead of what it passes on, so that it does not wait at the sender.
+    """
+    waiting = in_modem = carried = longest_s = 0.0
+    arrived: deque[float] = deque([0.0] * round(RTT_S / STEP_S))
     sent: Counter[str] = Counter()
     budget.forget(start_s)
     for step in range(round(seconds / STEP_S)):
@@ -35,12 +45,16 @@ def run(
                 if budget.admits(topic, size, now_s):
                     waiting += size + OVERHEAD_BYTES
                     sent[topic.name] += step * STEP_S >= seconds / 2
-        carried = min(waiting, rate_bytes_per_s * STEP_S)
-        waiting, acked = waiting - carried, acked + carried
+        moved = min(waiting, max(modem_bytes, rate_bytes_per_s * STEP_S) - in_modem)
+        waiting, in_modem = waiting - moved, in_modem + moved
+        passed = min(in_modem, rate_bytes_per_s * STEP_S)
+        in_modem, carried = in_modem - passed, carried + passed
+        arrived.append(carried)
+        acked = arrived.popleft()
         if step * STEP_S >= seconds / 2:
-            longest_s = max(longest_s, waiting / rate_bytes_per_s)
+            longest_s = max(longest_s, (waiting + in_modem) / rate_bytes_per_s)
         if step % 10 == 9:
-            budget.observe(TcpState(int(acked), int(waiting), 0, 0, 0.4), now_s)
+            budget.observe(state(acked, waiting, sent=carried + in_modem), now_s)
     return sent, longest_s
 
 
@@ -68,6 +82,68 @@ def test_a_slow_link_keeps_what_is_needed_and_its_queue_short(rate_bytes_per_s: 
     assert longest_s < 1.0
     assert "slow link" in budget.words(60.0)
     assert "imu" in budget.words(60.0)
+
+
+@pytest.mark.parametrize("rate_bytes_per_s", [16e3, 30e3, 60e3])
+def test_the_queue_of_a_modem_stays_short_from_the_beginning(rate_bytes_per_s: float) -> None:
+    """All that is sent goes into the modem at once: nothing waits at the sender, which sees only late answers."""
+    budget = LinkBudget()
+    budget.begin_low(0.0)
+    for start_s, seconds, most_s in ((0.0, 10.0, 1.5), (10.0, 60.0, 0.7)):
+        sent, longest_s = run(rate_bytes_per_s, seconds, budget, start_s, modem_bytes=1e6)
+        assert sent["candidates"] == 5 * seconds / 2
+        assert longest_s < most_s
+    # It is used.
+    carried = sum(sent[topic.name] * (size + OVERHEAD_BYTES) for topic, _, size in SENT) / 30.0
+    assert carried > min(0.75 * rate_bytes_per_s, 50e3)
+
+
+def test_a_long_link_with_room_soon_carries_everything() -> None:
+    budget = LinkBudget()
+    budget.begin_low(0.0)
+    run(1e6, 20.0, budget, modem_bytes=1e6)
+    sent, _ = run(1e6, 40.0, budget, start_s=20.0, modem_bytes=1e6)
+    assert sent == {topic.name: rate_hz * 20 for topic, rate_hz, _ in SENT}
+    assert budget.bytes_per_s is None
+
+
+def test_delays_over_losses_say_nothing_of_a_queue() -> None:
+    delay = AckDelay()
+    at_s = [0.0, 0.1, 0.6, 0.7, 1.8, 2.9]
+    # (acknowledged, sent, sent again): 200 bytes in half a second; 100, of which a packet was lost, in one.
+    for now_s, (acked, sent, again) in zip(
+        at_s, [(0, 0, 0), (0, 200, 0), (200, 200, 0), (200, 300, 0), (300, 300, 100), (300, 300, 100)], strict=True
+    ):
+        delay.observe(state(acked, 0, sent=sent)._replace(sent_again=again), now_s)
+        if now_s == 0.6:
+            assert delay.least_s == pytest.approx(0.5)
+    assert delay.least_s is None
+
+
+def test_a_link_that_is_hardly_used_keeps_its_budget_when_it_is_late() -> None:
+    budget = LinkBudget()
+    run(30e3, 30.0, budget)
+    limit = budget.bytes_per_s
+    assert limit is not None
+    budget.forget(30.0)
+    acked: deque[int] = deque([0] * 10)
+    for step in range(100):
+        acked.append(100 * step)
+        budget.observe(state(acked.popleft(), 0, sent=100 * step), 30.0 + step / 10)
+    assert budget.bytes_per_s >= limit
+
+
+def test_a_budget_is_not_lifted_while_what_was_missed_waits_for_it() -> None:
+    budget = LinkBudget()
+    run(30e3, 30.0, budget)
+    for step in range(400):
+        at_s = 30.0 + step / 10
+        while budget.admits_spare(5000, at_s):
+            pass
+        budget.observe(state(0, 0), at_s)
+    assert budget.bytes_per_s is not None
+    clear(budget, 21.0, 70.0)
+    assert budget.bytes_per_s is None
 
 
 def test_a_link_that_recovers_carries_everything_again() -> None:
@@ -101,7 +177,7 @@ def test_a_cut_teaches_nothing(cut_s: float, new_connection: bool) -> None:
             waiting = acked = 0.0
             budget.forget(now_s)
         if step % 10 == 9:
-            budget.observe(TcpState(int(acked), int(waiting), 0, 0, 0.001), now_s)
+            budget.observe(state(acked, waiting, 0.001), now_s)
         least = min(least, budget.bytes_per_s or float("inf"))
     assert sent == {topic.name: rate_hz * 8 for topic, rate_hz, _ in SENT}
     assert least > 10 * sum(rate_hz * (size + OVERHEAD_BYTES) for _, rate_hz, size in SENT)
@@ -113,10 +189,10 @@ def test_copies_go_on_a_slow_link_that_is_not_behind() -> None:
     assert not budget.admits_copy(1000, 5.0)
     run(12e3, 20.0, budget, start_s=5.0)
     for step in range(20):
-        budget.observe(TcpState(0, 0, 0, 0, 0.4), 25.0 + step / 10)
+        budget.observe(state(0, 0), 25.0 + step / 10)
     assert budget.admits_copy(1000, 27.0)
     for step in range(20):
-        budget.observe(TcpState(1000 * step, 4096, 0, 0, 0.4), 27.0 + step / 10)
+        budget.observe(state(1000 * step, 4096), 27.0 + step / 10)
     assert not budget.admits_copy(1000, 29.0)
     assert "messages come 1 s late or more, since 2 s ago" in budget.words(29.0)
 
@@ -128,7 +204,7 @@ def test_copies_go_on_beside_a_connection_that_a_lost_packet_has_stopped() -> No
     for step in range(40):
         now_s = 20.0 + step / 10
         # After a second and a half it carries four bytes at a time.
-        budget.observe(TcpState(10**6 + min(1000 * step, 15_000) + 4 * step, 4096, 0, 0, 0.4), now_s)
+        budget.observe(state(10**6 + min(1000 * step, 15_000) + 4 * step, 4096), now_s)
         copied.append(budget.admits_copy(1000, now_s))
     assert copied[0]
     assert not any(copied[12:32])
@@ -138,7 +214,7 @@ def test_copies_go_on_beside_a_connection_that_a_lost_packet_has_stopped() -> No
 def clear(budget: LinkBudget, seconds: float, start_s: float, waiting: int = 0) -> float:
     """Let the connection be seen with so many bytes waiting for some time; return its end."""
     for step in range(round(10 * seconds) + 1):
-        budget.observe(TcpState(0, waiting, 0, 0, 0.4), start_s + step / 10)
+        budget.observe(state(0, waiting), start_s + step / 10)
     return start_s + seconds
 
 
@@ -156,7 +232,7 @@ def test_answers_of_a_flood_of_questions_get_their_share_of_a_slow_link() -> Non
     for step in range(1000):
         for _ in range(10):
             sent += 1100 if budget.admits_answer(1000, now_s + step / 100) else 0
-        budget.observe(TcpState(0, 0, 0, 0, 0.4), now_s + step / 100)
+        budget.observe(state(0, 0), now_s + step / 100)
     # A second's budget at once, and the share for ten seconds; the limit rises by 3 % a second meanwhile.
     assert 10 * ANSWER_SHARE * limit < sent < 1.35 * (1 + 10 * ANSWER_SHARE) * limit + 1100
 
@@ -167,7 +243,7 @@ def test_candidates_and_copies_that_use_up_a_slow_link_leave_the_answers_their_s
     sent, now_s = 0, clear(budget, 1.0, 30.0)
     for step in range(100):
         at_s = now_s + step / 10
-        budget.observe(TcpState(0, 0, 0, 0, 0.4), at_s)
+        budget.observe(state(0, 0), at_s)
         assert budget.admits(topics.CANDIDATES, 4000, at_s)
         assert budget.admits_copy(8000, at_s)
         sent += budget.admits_answer(1000, at_s)
