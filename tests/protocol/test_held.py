@@ -19,7 +19,7 @@ from buddyline.protocol.held import (
     pages,
 )
 from buddyline.protocol.link_budget import LinkBudget
-from buddyline.protocol.zenoh_bus import open_hub
+from buddyline.protocol.zenoh_bus import held_desk, open_hub
 from buddyline.protocol.zenoh_bus.held_desk import BURST_BYTES, BYTES_PER_S, HeldDesk
 from buddyline.protocol.zenoh_bus.session import config_of
 from buddyline.protocol.zenoh_bus.settings import client_settings
@@ -133,6 +133,27 @@ def test_a_flood_of_questions_is_answered_up_to_a_bound_and_a_gap_before_it() ->
             inbox.wait_for(101)
             until(lambda: sum(came) > BYTES_PER_S or time.monotonic() - begin_s > 3.0, 0.05)
             assert sum(came) <= BURST_BYTES + BYTES_PER_S * (time.monotonic() - begin_s)
+
+
+def test_a_question_for_a_gap_is_not_pushed_out_by_those_that_follow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A flood has 50 between two looks of its owner. The gap's question came again and again, for up to 1.5 s."""
+    monkeypatch.setattr(held_desk, "LOOK_S", 0.5)
+    endpoint = free_endpoint()
+    with open_hub(endpoint), zenoh.open(config_of(client_settings(endpoint, None))) as session:
+        held = Held(1000)
+        for number in range(20):
+            held.add(HeldMessage(number, b"x", again=False))
+        desk = HeldDesk(session, lambda: None, FailureLatch())
+        source = f"buddyline/node/a/candidates/@adv/pub/{session.zid()}/1/_"
+        desk.show(source, held, topics.CANDIDATES.encoding)
+        try:
+            gap = session.get(f"{source}?_sn=7..7", timeout=60.0)
+            for _ in range(200):
+                session.get(source, lambda _: None, timeout=60.0)
+            pages = [open_page(reply.ok.payload.to_bytes()) for reply in gap if reply.ok is not None]
+        finally:
+            desk.close()
+    assert [message.number for _, messages in pages for message in messages] == [7]
 
 
 def test_what_a_slow_link_cannot_carry_is_told_to_be_gone_and_holds_back_nothing() -> None:
