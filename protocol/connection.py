@@ -30,7 +30,7 @@ class TcpState(NamedTuple):
     """Counts of one connection. acked: bytes that the other end has acknowledged. waiting: bytes not yet sent.
 
     received: bytes that have arrived. unread: of these, bytes that the library has not taken. min_rtt_s: shortest
-    round trip of late. sent: bytes that were sent, each counted once; sent_again: those that were lost.
+    round trip of late. sent: bytes that were sent, each counted once; sent_again: those of later attempts.
     """
 
     acked: int

@@ -18,21 +18,25 @@ BEHIND_S: Final = 1.0
 AGAIN_S: Final = 1.0
 LESS: Final = 0.8
 MORE_PER_S: Final = 0.03
-# Before that, what is queued in a modem delays the acknowledgements. By so much, a link is given no more; by twice as
-# much, it is full. The shortest of this time counts.
-QUEUED_S: Final = 0.15
+# Before anything waits here, what is queued in a modem delays the acknowledgements. By so much, a link is given no
+# more; by twice as much, it is full. The shortest of this time counts.
+QUEUED_S: Final = 0.1
 LEAST_OVER_S: Final = 1.0
+# The connection is looked at after this time, as a rule.
+LOOK_S: Final = 0.1
 # It is not given more than so many times what is sent on it.
 MOST_PER_OFFERED: Final = 1.25
-# A link with a long round trip may be slow. It begins with little, and is given more much sooner until it is full once.
+# A link with a long round trip may be slow. It begins with little, and is given more much sooner until something is
+# queued, and while it carries more than its limit: candidates always go.
 FIRST_BYTES_PER_S: Final = 8000.0
 FIRST_MORE_PER_S: Final = 0.3
 # JSON is compressed on the way, how much so is not known: so many bytes of messages are in one that was acknowledged.
 MOST_PER_ACKED: Final = 1.5
 LEAST_PER_ACKED: Final = 0.8
 LEAST_BYTES_PER_S: Final = 1000.0
-# A limit that has left nothing out for so long, and let nothing wait, is lifted.
+# A limit that has left nothing out for so long, and let nothing wait, is lifted if so much of it is used.
 LIFT_S: Final = 20.0
+LIFT_SHARE: Final = 0.5
 OBSERVED_S: Final = 2.0
 # Of a message besides its payload: headers of Zenoh, TLS, TCP and IP, and the acknowledgement.
 OVERHEAD_BYTES: Final = 100
@@ -46,26 +50,28 @@ ANSWER_SHARE: Final = 0.25
 
 
 class AckDelay:
-    """How long after it was sent the other end acknowledges what a connection sends. least_s: None if unknown.
+    """How long after it was sent the other end acknowledges what a connection sends.
 
-    Where packets were lost meanwhile, the time shows the loss and nothing else: it does not count.
+    least_s: the shortest of late; None if unknown. Where packets were lost meanwhile, the time shows the loss and
+    nothing else: it does not count. Nor does what a busy machine takes longer than LOOK_S to the next look.
     """
 
     def __init__(self) -> None:
         self.least_s: float | None = None
-        self._last: int | None = None
+        self._last: tuple[float, int] | None = None
         self._sent: deque[tuple[float, TcpState]] = deque()
         self._delays_s: deque[tuple[float, float]] = deque()
 
     def observe(self, state: TcpState, now_s: float) -> None:
-        """Take the state of the connection; the times between two calls limit what is known of the delay."""
-        if self._last is not None and state.sent > self._last:
-            self._sent.append((now_s, state))
-        self._last = state.sent
+        """Take the state of the connection."""
+        last_s, last_sent = self._last or (now_s, state.sent)
+        self._last = now_s, state.sent
         while self._sent and self._sent[0][1].sent <= state.acked:
             sent_s, then = self._sent.popleft()
             if then.sent_again == state.sent_again:
-                self._delays_s.append((now_s, now_s - sent_s))
+                self._delays_s.append((now_s, min(now_s, last_s + LOOK_S) - sent_s))
+        if state.sent > last_sent:
+            self._sent.append((now_s, state))
         while self._delays_s and now_s - self._delays_s[0][0] > LEAST_OVER_S:
             self._delays_s.popleft()
         self.least_s = min((delay_s for _, delay_s in self._delays_s), default=None)
@@ -83,6 +89,7 @@ class LinkBudget:
         self._lock = threading.Lock()
         self._limit: float | None = None
         self._more_per_s = MORE_PER_S
+        self._is_long = self._is_slow = self._was_lifted = False
         self._tokens = 0.0
         self._answer_tokens = 0.0
         self._tokens_s = 0.0
@@ -102,6 +109,11 @@ class LinkBudget:
     def bytes_per_s(self) -> float | None:
         """What the link is given, payloads and headers; None: no limit is known."""
         return self._limit
+
+    @property
+    def is_slow(self) -> bool:
+        """Whether the link has a limit and has been full."""
+        return self._is_slow and self._limit is not None
 
     def admits(self, topic: Topic, size_bytes: int, now_s: float) -> bool:
         """Return whether to send a message of a topic; if so, count it as sent. now_s: monotonic."""
@@ -158,7 +170,7 @@ class LinkBudget:
             return True
 
     def observe(self, state: TcpState, now_s: float, beside: int = 0) -> None:
-        """Take the state of the connection, ten times a second; a new connection begins with `forget`.
+        """Take the state of the connection, each LOOK_S; a new connection begins with `forget`.
 
         beside: bytes that were acknowledged on others which share the link. A link on which nothing is acknowledged is
         cut, or waits for a lost packet: nothing is learned from that.
@@ -182,13 +194,14 @@ class LinkBudget:
             if now_s - self._full_s > FULL_S:
                 if now_s - self._moved_s <= patience_s:
                     self._reduce(now_s)
-            elif self._limit is not None and len(self._seen) > 1:
-                self._adapt(self._limit, now_s)
+            else:
+                self._adapt(now_s)
 
-    def begin_low(self, now_s: float) -> None:
-        """Begin with little on a link with a long round trip, if no limit is known."""
+    def note_long(self, now_s: float) -> None:
+        """Take it that the connection has a long round trip: begin with little, if nothing is known of the link."""
         with self._lock:
-            if self._limit is None:
+            self._is_long = True
+            if self._limit is None and not self._was_lifted:
                 self._set_limit(FIRST_BYTES_PER_S, now_s)
                 self._more_per_s = FIRST_MORE_PER_S
 
@@ -197,6 +210,7 @@ class LinkBudget:
         with self._lock:
             self._seen.clear()
             self._delay = AckDelay()
+            self._is_long = False
             self._clear_s = self._full_s = now_s
             self._moved_s = float("-inf")
 
@@ -248,23 +262,31 @@ class LinkBudget:
     def _reserve(self, topic: Topic) -> float:
         return _RESERVES[topic.shed] * (self._limit or 0.0)
 
-    def _adapt(self, limit: float, now_s: float) -> None:
+    def _adapt(self, now_s: float) -> None:
         """Change the limit of a link on which nothing waits here."""
-        (begin_s, offered, _), (before_s, _, _), (_, _, state) = self._seen[0], self._seen[-2], self._seen[-1]
+        limit, (begin_s, offered, _) = self._limit, self._seen[0]
+        if now_s - begin_s < OBSERVED_S / 2.0 or (limit is None and not self._is_long):
+            return
+        (before_s, _, _), (_, _, state) = self._seen[-2], self._seen[-1]
         offered_rate = (self._offered - offered) / (now_s - begin_s)
+        since_s = now_s - self._reduced_s
         # Nothing is known while nothing is sent.
         queued_s = QUEUED_S if self._delay.least_s is None else self._delay.least_s - state.min_rtt_s
-        since_s = now_s - self._reduced_s
         if queued_s > QUEUED_S:
             self._more_per_s = MORE_PER_S
-        if queued_s > 2.0 * QUEUED_S and offered_rate > LESS * limit and since_s > AGAIN_S + 2.0 * state.min_rtt_s:
-            self._set_limit(max(LESS * limit, LEAST_BYTES_PER_S), now_s)
+        if queued_s > 2.0 * QUEUED_S:
+            used = offered_rate if limit is None else limit
+            if offered_rate >= LESS * used and since_s > AGAIN_S + 2.0 * state.min_rtt_s:
+                self._is_slow = True
+                self._set_limit(max(LESS * used, LEAST_BYTES_PER_S), now_s)
+        elif limit is None:
+            return
         elif queued_s < QUEUED_S and since_s > AGAIN_S:
-            # What is sent now is carried; of more nobody knows.
+            more_per_s = FIRST_MORE_PER_S if offered_rate > limit else self._more_per_s
             most = max(MOST_PER_OFFERED * offered_rate, limit)
-            self._limit = min(max(limit * (1.0 + self._more_per_s * (now_s - before_s)), offered_rate), most)
-        if now_s - max(self._shed_s, self._reduced_s) > LIFT_S:
-            self._limit = None
+            self._limit = min(limit * (1.0 + more_per_s * (now_s - before_s)), most)
+        if now_s - max(self._shed_s, self._reduced_s) > LIFT_S and offered_rate > LIFT_SHARE * (self._limit or 0.0):
+            self._limit, self._was_lifted = None, True
 
     def _reduce(self, now_s: float) -> None:
         begin_s, offered, state = self._seen[0]
@@ -275,6 +297,7 @@ class LinkBudget:
         acked_rate = (self._seen[-1][2].acked - state.acked) / span_s
         limit = max(min(LESS * offered_rate, MOST_PER_ACKED * acked_rate), LEAST_PER_ACKED * acked_rate)
         self._more_per_s = MORE_PER_S
+        self._is_slow = True
         self._set_limit(max(min(limit, self._limit or limit), LEAST_BYTES_PER_S), now_s)
 
     def _set_limit(self, limit: float, now_s: float) -> None:

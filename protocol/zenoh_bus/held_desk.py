@@ -21,7 +21,7 @@ LOOK_S: Final = 0.05
 # Of all answers of a process. At first a minute of two streams of samples and of frames at 30 Hz goes at once.
 BYTES_PER_S: Final = 4_000_000.0
 BURST_BYTES: Final = 16_000_000.0
-# Questions that wait: of a publisher between two looks, where a flood's (50) must not push out the others', and of all.
+# Questions that wait: of a publisher between two looks (a flood has 50, and must not push out the others), and of all.
 MAX_ASKED: Final = 256
 MAX_WAITING: Final = 64
 # Nobody waits longer for an answer. On a long way it must come before the question's end, too.
@@ -160,7 +160,7 @@ class HeldDesk:
                 continue
         self._waiting.sort(key=lambda question: question.count)
         budget = self._budget()
-        is_slow = budget is not None and budget.bytes_per_s is not None
+        is_slow = budget is not None and budget.is_slow
         patience_s = LONG_PATIENCE_S if is_slow else PATIENCE_S
         late = [question for question in self._waiting if now_s - question.since_s > patience_s]
         for question in late:

@@ -11,10 +11,9 @@ from typing import Final
 import zenoh
 from buddyline.protocol.connection import Connection, TcpState, close_without_wait
 from buddyline.protocol.delivery import CLOSE_S
-from buddyline.protocol.link_budget import LinkBudget
+from buddyline.protocol.link_budget import LOOK_S, LinkBudget
 from buddyline.protocol.zenoh_bus.session import SecondLink
 
-LOOK_S: Final = 0.1
 # The connection is looked for at most this often.
 FIND_S: Final = 0.5
 # What the kernel takes ahead of what is sent: so much may a less urgent message delay an urgent one.
@@ -60,7 +59,7 @@ class Link:
     @property
     def is_slow(self) -> bool:
         """Whether an answer may take long on it."""
-        return self.is_long or self._budget.bytes_per_s is not None
+        return self.is_long or self._budget.is_slow
 
     def heard_within(self, seconds: float) -> bool:
         """Return whether Zenoh has read anything from the hub in this time."""
@@ -97,6 +96,7 @@ class Link:
         close_without_wait()
         self.is_long = False
         self._budget.forget(time.monotonic())
+        self._note_length(connection, connection.state())
         read, changed_s = -1, time.monotonic()
         look_s = 0.0
         while not self._stop.is_set():
@@ -127,7 +127,7 @@ class Link:
         is_long = state is not None and state.min_rtt_s > LONG_RTT_S
         if is_long and not self.is_long:
             connection.bear_losses()
-            self._budget.begin_low(time.monotonic())
+            self._budget.note_long(time.monotonic())
         self.is_long = is_long
 
 
