@@ -22,6 +22,8 @@ _NOT_SENT: Final = (144, "I")
 _SENT: Final = (200, "Q")
 _SENT_AGAIN: Final = (208, "Q")
 _ESTABLISHED: Final = 1
+# A link with a longer round trip is treated as a long one: a tether over radio or a modem, not a cable.
+LONG_RTT_S: Final = 0.05
 # Of Linux; Python's socket module does not have it.
 _TCP_NOTSENT_LOWAT: Final = 25
 
@@ -40,6 +42,11 @@ class TcpState(NamedTuple):
     min_rtt_s: float
     sent: int
     sent_again: int
+
+    @property
+    def is_long(self) -> bool:
+        """Whether the round trip is long."""
+        return self.min_rtt_s > LONG_RTT_S
 
 
 class Connection:

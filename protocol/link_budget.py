@@ -24,17 +24,17 @@ QUEUED_S: Final = 0.1
 LEAST_OVER_S: Final = 1.0
 # The connection is looked at after this time, as a rule.
 LOOK_S: Final = 0.1
-# It is not given more than so many times what is sent on it.
+# A limit does not grow above so many times what is sent.
 MOST_PER_OFFERED: Final = 1.25
-# A link with a long round trip may be slow. It begins with little, and is given more much sooner until something is
-# queued, and while it carries more than its limit: candidates always go.
+# A link with a long round trip may be slow. It begins with little. The limit grows faster until something is queued for
+# the first time, and while more is sent than the limit: candidates always go.
 FIRST_BYTES_PER_S: Final = 8000.0
 FIRST_MORE_PER_S: Final = 0.3
 # JSON is compressed on the way, how much so is not known: so many bytes of messages are in one that was acknowledged.
 MOST_PER_ACKED: Final = 1.5
 LEAST_PER_ACKED: Final = 0.8
 LEAST_BYTES_PER_S: Final = 1000.0
-# A limit that has left nothing out for so long, and let nothing wait, is lifted if so much of it is used.
+# A limit is lifted if for so long nothing was left out and nothing had to wait for it, and so much of it is used.
 LIFT_S: Final = 20.0
 LIFT_SHARE: Final = 0.5
 OBSERVED_S: Final = 2.0
@@ -88,8 +88,7 @@ class LinkBudget:
         self.shed: Counter[str] = Counter()
         self._lock = threading.Lock()
         self._limit: float | None = None
-        self._more_per_s = MORE_PER_S
-        self._is_long = self._is_slow = self._was_lifted = False
+        self._is_slow = self._was_lifted = False
         self._tokens = 0.0
         self._answer_tokens = 0.0
         self._tokens_s = 0.0
@@ -112,7 +111,7 @@ class LinkBudget:
 
     @property
     def is_slow(self) -> bool:
-        """Whether the link has a limit and has been full."""
+        """Whether the link has a limit, and something was queued on it since the last limit was lifted."""
         return self._is_slow and self._limit is not None
 
     def admits(self, topic: Topic, size_bytes: int, now_s: float) -> bool:
@@ -197,20 +196,17 @@ class LinkBudget:
             else:
                 self._adapt(now_s)
 
-    def note_long(self, now_s: float) -> None:
-        """Take it that the connection has a long round trip: begin with little, if nothing is known of the link."""
+    def begin_low(self, now_s: float) -> None:
+        """Begin with little, on a link with a long round trip of which nothing is known."""
         with self._lock:
-            self._is_long = True
             if self._limit is None and not self._was_lifted:
                 self._set_limit(FIRST_BYTES_PER_S, now_s)
-                self._more_per_s = FIRST_MORE_PER_S
 
     def forget(self, now_s: float) -> None:
         """Begin anew with another connection; the limit stays."""
         with self._lock:
             self._seen.clear()
             self._delay = AckDelay()
-            self._is_long = False
             self._clear_s = self._full_s = now_s
             self._moved_s = float("-inf")
 
@@ -264,29 +260,26 @@ class LinkBudget:
 
     def _adapt(self, now_s: float) -> None:
         """Change the limit of a link on which nothing waits here."""
-        limit, (begin_s, offered, _) = self._limit, self._seen[0]
-        if now_s - begin_s < OBSERVED_S / 2.0 or (limit is None and not self._is_long):
+        limit, (begin_s, offered, _), (_, _, state) = self._limit, self._seen[0], self._seen[-1]
+        if now_s - begin_s < OBSERVED_S / 2.0 or (limit is None and not state.is_long):
             return
-        (before_s, _, _), (_, _, state) = self._seen[-2], self._seen[-1]
         offered_rate = (self._offered - offered) / (now_s - begin_s)
         since_s = now_s - self._reduced_s
         # Nothing is known while nothing is sent.
         queued_s = QUEUED_S if self._delay.least_s is None else self._delay.least_s - state.min_rtt_s
-        if queued_s > QUEUED_S:
-            self._more_per_s = MORE_PER_S
+        self._is_slow |= queued_s > QUEUED_S
         if queued_s > 2.0 * QUEUED_S:
             used = offered_rate if limit is None else limit
             if offered_rate >= LESS * used and since_s > AGAIN_S + 2.0 * state.min_rtt_s:
-                self._is_slow = True
                 self._set_limit(max(LESS * used, LEAST_BYTES_PER_S), now_s)
         elif limit is None:
             return
         elif queued_s < QUEUED_S and since_s > AGAIN_S:
-            more_per_s = FIRST_MORE_PER_S if offered_rate > limit else self._more_per_s
+            more_per_s = MORE_PER_S if self._is_slow and offered_rate <= limit else FIRST_MORE_PER_S
             most = max(MOST_PER_OFFERED * offered_rate, limit)
-            self._limit = min(limit * (1.0 + more_per_s * (now_s - before_s)), most)
+            self._limit = min(limit * (1.0 + more_per_s * (now_s - self._seen[-2][0])), most)
         if now_s - max(self._shed_s, self._reduced_s) > LIFT_S and offered_rate > LIFT_SHARE * (self._limit or 0.0):
-            self._limit, self._was_lifted = None, True
+            self._limit, self._is_slow, self._was_lifted = None, False, True
 
     def _reduce(self, now_s: float) -> None:
         begin_s, offered, state = self._seen[0]
@@ -296,7 +289,6 @@ class LinkBudget:
         offered_rate = (self._offered - offered) / span_s
         acked_rate = (self._seen[-1][2].acked - state.acked) / span_s
         limit = max(min(LESS * offered_rate, MOST_PER_ACKED * acked_rate), LEAST_PER_ACKED * acked_rate)
-        self._more_per_s = MORE_PER_S
         self._is_slow = True
         self._set_limit(max(min(limit, self._limit or limit), LEAST_BYTES_PER_S), now_s)
 

@@ -21,7 +21,8 @@ LOOK_S: Final = 0.05
 # Of all answers of a process. At first a minute of two streams of samples and of frames at 30 Hz goes at once.
 BYTES_PER_S: Final = 4_000_000.0
 BURST_BYTES: Final = 16_000_000.0
-# Questions that wait: of a publisher between two looks (a flood has 50, and must not push out the others), and of all.
+# Questions that wait: of a publisher between two looks, and of all. A flood asks 50 times between two looks. It must
+# not push out the question about a gap.
 MAX_ASKED: Final = 256
 MAX_WAITING: Final = 64
 # Nobody waits longer for an answer. On a long way it must come before the question's end, too.

@@ -21,9 +21,6 @@ AHEAD_BYTES: Final = 4096
 # Bytes that nobody has read for this time: longer than a busy machine leaves a thread without its turn.
 UNREAD_S: Final = 3.0
 
-# With a longer round trip, small messages go together. Each packet may be lost, and then holds up all later ones for
-# more than a round trip: fewer packets are worth a wait that is short beside it.
-LONG_RTT_S: Final = 0.05
 # Zenoh's own thread hands a message to the kernel within this time.
 HANDED_OVER_S: Final = 0.005
 
@@ -47,7 +44,7 @@ class Link:
         self._flush = threading.Event()
         self.is_long = False
         self._heard_s = time.monotonic()
-        # Before anything is sent: it may be too much for a long way.
+        # Before the first message: at full rate a second's messages fill the queue of a slow modem.
         with contextlib.suppress(zenoh.ZError):
             connection = self.connection()
             if connection is not None:
@@ -102,6 +99,8 @@ class Link:
         while not self._stop.is_set():
             if self._flush.wait(LOOK_S) and not self._stop.wait(HANDED_OVER_S):
                 self._flush.clear()
+                # Each packet may be lost, and then holds up all later ones for more than a round trip: if that is long,
+                # fewer packets are worth the wait of small messages for each other.
                 if self.is_long:
                     connection.cork()
             now_s = time.monotonic()
@@ -124,10 +123,10 @@ class Link:
                 return
 
     def _note_length(self, connection: Connection, state: TcpState | None) -> None:
-        is_long = state is not None and state.min_rtt_s > LONG_RTT_S
+        is_long = state is not None and state.is_long
         if is_long and not self.is_long:
             connection.bear_losses()
-            self._budget.note_long(time.monotonic())
+            self._budget.begin_low(time.monotonic())
         self.is_long = is_long
 
 

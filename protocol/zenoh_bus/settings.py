@@ -15,9 +15,9 @@ from buddyline.protocol.topics import LOG, TOPICS
 # Nothing repeats a lost one of the four datagrams that open a session. The next attempt comes after two round trips of
 # a long link and a second in its modem's queue.
 DATAGRAM_OPEN_MS: Final = 2500
-# lease, ms: a link that is silent for this time counts as dead. keep_alive: so many packets go in this time on a link
-# that is idle. Where packets are lost, the next one's acknowledgement shows it; with four of them (Zenoh's default) two
-# losses in succession are a silence longer than the lease. open_timeout, ms: how long a client waits for a hub that
+# lease, ms: a link that is silent for this time counts as dead. keep_alive: how many packets an idle link sends in this
+# time. TCP finds a lost packet by the acknowledgement of the next. With four packets (Zenoh's default), two losses in
+# succession make a silence that is longer than the lease. open_timeout, ms: how long a client waits for a hub that
 # accepts the connection but does not answer; a slow link needs seconds for its five round trips. compression: for slow
 # links; both ends must have it. queue: messages of this urgency go at once, each in a batch of its own, and Zenoh drops
 # those for which no batch is free; a lost packet holds up a long link for the time of several frames.
