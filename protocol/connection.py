@@ -15,6 +15,7 @@ _DESCRIPTORS: Final = "/proc/self/fd"
 # Linux's struct tcp_info: the offset and format of what is read of it.
 _INFO_BYTES: Final = 232
 _STATE: Final = (0, "B")
+_RTT_US: Final = (68, "I")
 _MIN_RTT_US: Final = (148, "I")
 _ACKED: Final = (120, "Q")
 _RECEIVED: Final = (128, "Q")
@@ -32,7 +33,8 @@ class TcpState(NamedTuple):
     """Counts of one connection. acked: bytes that the other end has acknowledged. waiting: bytes not yet sent.
 
     received: bytes that have arrived. unread: of these, bytes that the library has not taken. min_rtt_s: shortest
-    round trip of late. sent: bytes that were sent, each counted once; sent_again: those of later attempts.
+    round trip of late; rtt_s: smoothed over some packets that were not lost. sent: bytes that were sent, each counted
+    once; sent_again: those of later attempts.
     """
 
     acked: int
@@ -40,6 +42,7 @@ class TcpState(NamedTuple):
     received: int
     unread: int
     min_rtt_s: float
+    rtt_s: float
     sent: int
     sent_again: int
 
@@ -96,6 +99,7 @@ class Connection:
             received=_field(info, _RECEIVED),
             unread=unread,
             min_rtt_s=_field(info, _MIN_RTT_US) * 1e-6,
+            rtt_s=_field(info, _RTT_US) * 1e-6,
             sent=_field(info, _SENT) - sent_again,
             sent_again=sent_again,
         )

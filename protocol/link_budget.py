@@ -22,6 +22,9 @@ MORE_PER_S: Final = 0.03
 # more; by twice as much, it is full. The shortest of this time counts.
 QUEUED_S: Final = 0.1
 LEAST_OVER_S: Final = 1.0
+# Behind a longer queue candidates come too late. The link is then given so much less that the queue drains.
+LONG_QUEUE_S: Final = 0.5
+MUCH_LESS: Final = 0.5
 # The connection is looked at after this time, as a rule.
 LOOK_S: Final = 0.1
 # A limit does not grow above so many times what is sent.
@@ -29,7 +32,7 @@ MOST_PER_OFFERED: Final = 1.25
 # A link with a long round trip may be slow. It begins with little. The limit grows faster until something is queued for
 # the first time, and while more is sent than the limit: candidates always go.
 FIRST_BYTES_PER_S: Final = 8000.0
-FIRST_MORE_PER_S: Final = 0.3
+FIRST_MORE_PER_S: Final = 0.15
 # JSON is compressed on the way, how much so is not known: so many bytes of messages are in one that was acknowledged.
 MOST_PER_ACKED: Final = 1.5
 LEAST_PER_ACKED: Final = 0.8
@@ -265,16 +268,18 @@ class LinkBudget:
             return
         offered_rate = (self._offered - offered) / (now_s - begin_s)
         since_s = now_s - self._reduced_s
-        # Nothing is known while nothing is sent.
-        queued_s = QUEUED_S if self._delay.least_s is None else self._delay.least_s - state.min_rtt_s
+        # Behind a long queue every delay is one over a loss. The smoothed round trip is late, but it remains.
+        delay_s = state.rtt_s if self._delay.least_s is None else self._delay.least_s
+        queued_s = delay_s - state.min_rtt_s
         self._is_slow |= queued_s > QUEUED_S
         if queued_s > 2.0 * QUEUED_S:
             used = offered_rate if limit is None else limit
-            if offered_rate >= LESS * used and since_s > AGAIN_S + 2.0 * state.min_rtt_s:
-                self._set_limit(max(LESS * used, LEAST_BYTES_PER_S), now_s)
+            if offered_rate >= LESS * used and since_s > AGAIN_S + state.min_rtt_s + delay_s:
+                less = LESS if queued_s < LONG_QUEUE_S else MUCH_LESS
+                self._set_limit(max(less * used, LEAST_BYTES_PER_S), now_s)
         elif limit is None:
             return
-        elif queued_s < QUEUED_S and since_s > AGAIN_S:
+        elif self._delay.least_s is not None and queued_s < QUEUED_S and since_s > AGAIN_S:
             more_per_s = MORE_PER_S if self._is_slow and offered_rate <= limit else FIRST_MORE_PER_S
             most = max(MOST_PER_OFFERED * offered_rate, limit)
             self._limit = min(limit * (1.0 + more_per_s * (now_s - self._seen[-2][0])), most)

@@ -23,7 +23,7 @@ SENT = (  # topic, rate (Hz), payload (bytes)
 
 def state(acked: float, waiting: float, min_rtt_s: float = RTT_S, sent: float | None = None) -> TcpState:
     """Return what a connection shows. sent: default: no more than is acknowledged."""
-    return TcpState(int(acked), int(waiting), 0, 0, min_rtt_s, int(acked if sent is None else sent), 0)
+    return TcpState(int(acked), int(waiting), 0, 0, min_rtt_s, min_rtt_s, int(acked if sent is None else sent), 0)
 
 
 def run(
@@ -159,6 +159,21 @@ def test_a_long_link_that_had_room_gets_a_limit_when_it_has_none_any_more() -> N
     _, longest_s = run(30e3, 120.0, budget, start_s=60.0, modem_bytes=1e6)
     assert budget.is_slow
     assert longest_s < 0.7
+
+
+def test_a_queue_behind_which_every_delay_has_a_loss_shows_by_the_round_trip() -> None:
+    budget = LinkBudget()
+    run(1e6, 5.0, budget, modem_bytes=1e6)
+    limit = budget.bytes_per_s
+    assert limit is not None
+    budget.forget(5.0)
+    for step in range(50):
+        now_s = 5.0 + step / 10
+        for _ in range(2):
+            budget.admits(topics.CANDIDATES, 1000, now_s)
+        lossy = state(1000 * step, 0, sent=1000 * (step + 12))._replace(rtt_s=1.4, sent_again=1000 * step)
+        budget.observe(lossy, now_s)
+    assert budget.bytes_per_s < 0.6 * limit
 
 
 def test_a_burst_does_not_raise_a_budget_at_once() -> None:
