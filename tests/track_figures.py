@@ -1,7 +1,7 @@
 """The track's figures on simulated dives: errors as shares of the poses' errors, coverage, NEES, number of wrong rows.
 
     .venv/bin/python -m tests.track_figures                              # cavern, basin and lake, six seeds, a minute
-    .venv/bin/python -m tests.track_figures --inertial good
+    .venv/bin/python -m tests.track_figures --inertial fair --waters cavern --range 5 8 --seconds 120
     .venv/bin/python -m tests.track_figures --inertial none --range 4 8
     .venv/bin/python -m tests.track_figures --dead a.left --modes smooth
     .venv/bin/python -m tests.track_figures --dark 5 --range 4 8         # no light for 5 s in the middle
@@ -42,6 +42,7 @@ from buddyline.tools.evaluation.poses import pose_errors
 from buddyline.tools.evaluation.statistics import Stats
 from buddyline.tools.evaluation.tracks import TrackFigures, tracks_figures
 from buddyline.tools.evaluation.truth import TruthTrack
+from buddyline.tools.solve import solved as solve
 from msgspec.structs import replace
 
 START_NS = 1_764_000_000 * S_NS
@@ -113,7 +114,7 @@ def solved(seed: int, args: argparse.Namespace) -> list[TrackDive]:
         )
     )
     core = SolverCore(Settings(), [("a", "b")], track=TrackSettings(frozenset(args.modes)))
-    found = [*core.handle_many(told(world, args)), *core.flush()]
+    found = list(solve(core, told(world, args)))
     # What both nodes' stamps give lies between their clocks; the world's truth is told by A's.
     between_ns = round(0.5 * args.clock_ms * MS_NS)
 

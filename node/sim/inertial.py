@@ -23,8 +23,6 @@ GYRO_SIGMA_RADPS: Final = 0.004
 MAG_SIGMA_T: Final = 0.3e-6
 WALK_S: Final = (20.0, 200.0)
 """Shortest and longest period of a bias's wandering part, s."""
-SHAKE_S: Final = (0.1, 0.6)
-"""Shortest and longest period of the shaking by fin kicks, which turns and pushes the unit in its mount, s."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +32,8 @@ class Grade:
     lever_sigma_m: of each coordinate of the stated lever arm. misalignment_rad: the angle between the true and the
     stated mounting. delay_ns: least and greatest delay of the stamps, which NodeInfo does not state.
     gyro_bias_radps, accel_bias_mps2: constant biases. gyro_walk_radps, accel_walk_mps2: their wandering parts.
-    shake_mps2, shake_radps: shaking by fin kicks.
+    shake_mps2, shake_radps: shaking by fin kicks, which turns and pushes the unit in its mount; shake_s: its shortest
+    and longest period.
     """
 
     lever_sigma_m: float
@@ -46,10 +45,16 @@ class Grade:
     accel_walk_mps2: float
     shake_mps2: float
     shake_radps: float
+    shake_s: tuple[float, float] = (0.1, 0.6)
 
 
+# The fair one's shaking is that of an independent simulated dive, found by comparing its samples with its dense truth:
+# nothing below 7 Hz, nothing above 18 Hz.
 GRADES: Final[dict[InertialGrade, Grade]] = {
     "good": Grade(0.001, math.radians(0.1), (0, 0), 0.003, 0.02, 0.0003, 0.005, 0.0, 0.0),
+    "fair": Grade(
+        0.005, math.radians(1.0), (2 * MS_NS, 6 * MS_NS), 0.003, 0.05, 0.0003, 0.004, 0.09, 0.005, (0.055, 0.14)
+    ),
     "poor": Grade(0.005, math.radians(1.0), (2 * MS_NS, 6 * MS_NS), 0.003, 0.05, 0.002, 0.03, 0.2, 0.02),
 }
 
@@ -74,7 +79,7 @@ class InertialUnit:
         self._gyro_bias_radps = rng.normal(0.0, self._grade.gyro_bias_radps, 3)
         self._accel_bias_mps2 = rng.normal(0.0, self._grade.accel_bias_mps2, 3)
         self._walks = [Sway(rng, *WALK_S, 6) for _ in range(6)]
-        self._shakes = [Sway(rng, *SHAKE_S, 6) for _ in range(6)]
+        self._shakes = [Sway(rng, *self._grade.shake_s, 6) for _ in range(6)]
         self._R_ned_field = rotation.from_euler(0.0, 0.0, heading_off_rad)
 
     def sample(self, stamp_ns: int, t_s: float) -> tuple[Vector, Vector, Vector]:

@@ -14,7 +14,7 @@ from buddyline.protocol.topics import check_node_id
 
 Environment: TypeAlias = Literal["cavern", "night_reef", "lake", "basin", "day_reef"]
 Trajectory: TypeAlias = Literal["circles", "rest"]
-InertialGrade: TypeAlias = Literal["good", "poor"]
+InertialGrade: TypeAlias = Literal["good", "fair", "poor"]
 Decoy: TypeAlias = Literal["walls", "shells", "slabs", "bubbles", "lasers", "clock"]
 PictureExposure: TypeAlias = Literal["fixed", "auto"]
 ENVIRONMENTS: Final[tuple[str, ...]] = get_args(Environment)

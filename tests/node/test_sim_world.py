@@ -219,13 +219,13 @@ def test_a_poor_inertial_unit_is_turned_and_late_by_what_its_grade_says(monkeypa
         assert 0.25 * 0.02 < turned.max() < 1.001 * 0.02
 
 
-def test_a_poor_inertial_unit_is_worse_than_a_good_one():
+def test_a_shaken_inertial_unit_is_worse_than_a_good_one():
     off_mps2 = []
-    for grade in ("good", "poor"):
+    for grade in ("good", "fair", "poor"):
         world = World(Scenario(seed=6, inertial=grade))
         samples = [np.linalg.norm(world.imu("b", S_NS + k * S_NS // 100).accel_mps2) for k in range(300)]
         off_mps2.append(np.std(np.diff(samples)))
-    assert off_mps2[1] > 1.1 * off_mps2[0]
+    assert min(off_mps2[1:]) > 1.1 * off_mps2[0]
 
 
 def test_the_inertial_sensor_measures_the_motion():
