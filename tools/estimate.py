@@ -20,9 +20,10 @@ def sigma_m(estimate: Estimate) -> float:
 
 def range_sigma_m(estimate: Estimate) -> float:
     """Return a range's uncertainty (1 sd): the position's, along the line of sight."""
-    sight = np.array(estimate.t_a_b_m)
+    # A stranger's message may hold any number: a square of it might be none.
+    sight = np.array(estimate.t_a_b_m) / max(math.hypot(*estimate.t_a_b_m), 1e-9)
     covariance = np.array(estimate.covariance).reshape(6, 6)[:3, :3]
-    return math.sqrt(max(float(sight @ covariance @ sight), 0.0)) / max(float(np.linalg.norm(sight)), 1e-9)
+    return math.sqrt(max(float(sight @ covariance @ sight), 0.0))
 
 
 def known(estimate: Estimate, field: str) -> float | None:
