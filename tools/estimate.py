@@ -8,6 +8,7 @@ from typing import TypeAlias
 import numpy as np
 from buddyline.protocol.messages import RelativePose, Track
 from msgspec import UNSET
+from numpy.typing import NDArray
 
 # The pose of one trigger, or the fused estimate at any time. Fields with the same name have the same meaning.
 Estimate: TypeAlias = RelativePose | Track
@@ -20,10 +21,16 @@ def sigma_m(estimate: Estimate) -> float:
 
 def range_sigma_m(estimate: Estimate) -> float:
     """Return a range's uncertainty (1 sd): the position's, along the line of sight."""
-    # A stranger's message may hold any number: a square of it might be none.
-    sight = np.array(estimate.t_a_b_m) / max(math.hypot(*estimate.t_a_b_m), 1e-9)
-    covariance = np.array(estimate.covariance).reshape(6, 6)[:3, :3]
-    return math.sqrt(max(float(sight @ covariance @ sight), 0.0))
+    sight, _ = _scaled(np.array(estimate.t_a_b_m))
+    covariance, largest = _scaled(np.array(estimate.covariance).reshape(6, 6)[:3, :3])
+    along = float(sight @ covariance @ sight) / max(float(sight @ sight), 1e-9)
+    return math.sqrt(largest) * math.sqrt(max(along, 0.0))
+
+
+def _scaled(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Return values as shares of the largest, and that: squares of a stranger's numbers may be too large."""
+    largest = float(np.abs(values).max())
+    return (values / largest if largest else values), largest
 
 
 def known(estimate: Estimate, field: str) -> float | None:

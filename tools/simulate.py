@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--images", action="store_true", help="rendered pictures in place of synthetic candidates")
     choice(parser, "exposure", EXPOSURES, "of pictures; auto: locked to the lamps, as a node's camera does it; ")
     parser.add_argument("--imu", action="store_true", help="with raw inertial samples")
-    grades = "fair: mounted 1 deg off, stamped late, its mount rings; poor: also loose, with walking biases; "
+    grades = "fair: mounted 1 deg off, late, shaken at 7 to 18 Hz; poor: shaken by fins, with walking biases; "
     choice(parser, "inertial", INERTIAL_GRADES, grades)
     number(parser, "--width", "width_px", "PX", "of the pictures; ")
     world = parser.add_argument_group("the dive")

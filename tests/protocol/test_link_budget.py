@@ -7,7 +7,14 @@ from collections import Counter, deque
 import pytest
 from buddyline.protocol import topics
 from buddyline.protocol.connection import TcpState
-from buddyline.protocol.link_budget import ANSWER_SHARE, OVERHEAD_BYTES, QUEUED_S, AckDelay, LinkBudget
+from buddyline.protocol.link_budget import (
+    ANSWER_SHARE,
+    FIRST_BYTES_PER_S,
+    OVERHEAD_BYTES,
+    QUEUED_S,
+    AckDelay,
+    LinkBudget,
+)
 
 STEP_S = 0.01
 RTT_S = 0.4
@@ -161,19 +168,67 @@ def test_a_long_link_that_had_room_gets_a_limit_when_it_has_none_any_more() -> N
     assert longest_s < 0.7
 
 
-def test_a_queue_behind_which_every_delay_has_a_loss_shows_by_the_round_trip() -> None:
-    budget = LinkBudget()
-    run(1e6, 5.0, budget, modem_bytes=1e6)
-    limit = budget.bytes_per_s
-    assert limit is not None
-    budget.forget(5.0)
-    for step in range(50):
-        now_s = 5.0 + step / 10
+def send_over_losses(budget: LinkBudget, start_s: float, seconds: float, queued_s: float, *, acks: bool = True) -> None:
+    """Send 20 kB/s over a link on which each acknowledgement comes after a loss. acks: whether any come."""
+    budget.forget(start_s)
+    for step in range(round(seconds * 10)):
+        now_s, acked = start_s + step / 10, 1000 * step * acks
         for _ in range(2):
             budget.admits(topics.CANDIDATES, 1000, now_s)
-        lossy = state(1000 * step, 0, sent=1000 * (step + 12))._replace(rtt_s=1.4, sent_again=1000 * step)
+        lossy = state(acked, 0, sent=acked + 12_000)._replace(rtt_s=RTT_S + queued_s, sent_again=1000 * step)
         budget.observe(lossy, now_s)
-    assert budget.bytes_per_s < 0.6 * limit
+
+
+@pytest.mark.parametrize(("queued_s", "acks", "is_cut"), [(1.0, True, True), (0.4, True, False), (1.0, False, False)])
+def test_where_every_delay_is_over_a_loss_a_long_round_trip_shows_a_queue(
+    queued_s: float, acks: bool, is_cut: bool
+) -> None:
+    """A round trip is a mean: a little above the shortest it shows nothing. Nor does a stale one, of a cut link."""
+    budget = LinkBudget()
+    run(1e6, 5.0, budget, modem_bytes=1e6)
+    limit = budget.bytes_per_s or 0.0
+    assert limit > 0.0
+    send_over_losses(budget, 5.0, 3.0, queued_s, acks=acks)
+    assert budget.bytes_per_s == pytest.approx(0.5 * limit if is_cut else limit)
+
+
+def test_a_lifted_link_that_rests_gets_no_small_limit_by_the_delays_of_others() -> None:
+    budget = LinkBudget()
+    run(1e6, 60.0, budget, modem_bytes=1e6)
+    assert budget.bytes_per_s is None
+    budget.forget(60.0)
+    late = round((RTT_S + 0.4) / 0.1)
+    for step in range(100):
+        now_s = 60.0 + step / 10
+        if step % 10 == 0:
+            budget.admits(topics.NODE_STATUS, 200, now_s)
+        sent, acked = 300 * (step // 10 + 1), 300 * (max(step - late, -10) // 10 + 1)
+        budget.observe(state(acked, 0, sent=sent), now_s)
+    assert budget.bytes_per_s is None or budget.bytes_per_s >= FIRST_BYTES_PER_S
+
+
+def test_a_limit_is_not_lifted_while_a_queue_stands() -> None:
+    budget = LinkBudget()
+    run(1e6, 12.0, budget, modem_bytes=1e6)
+    limit = budget.bytes_per_s
+    assert limit is not None
+    budget.forget(12.0)
+    late, each = round((RTT_S + 0.3) / 0.1), round(0.065 * limit)
+    for step in range(400):
+        now_s = 12.0 + step / 10
+        budget.admits(topics.CANDIDATES, each - OVERHEAD_BYTES, now_s)
+        budget.observe(state(each * max(step - late, 0), 0, sent=each * step), now_s)
+    assert budget.bytes_per_s == limit
+
+
+def test_a_limit_grows_slowly_at_first_and_faster_below_what_is_always_sent() -> None:
+    budget = LinkBudget()
+    run(1e6, 8.0, budget, modem_bytes=1e6)
+    assert FIRST_BYTES_PER_S * 1.15**5 < (budget.bytes_per_s or 0.0) < FIRST_BYTES_PER_S * 1.15**7
+    send_over_losses(budget, 8.0, 20.0, 1.0)
+    assert budget.bytes_per_s == 1000.0
+    run(1e6, 8.0, budget, start_s=28.0, modem_bytes=1e6)
+    assert (budget.bytes_per_s or 0.0) > 1000.0 * 1.3**5
 
 
 def test_a_burst_does_not_raise_a_budget_at_once() -> None:
