@@ -30,10 +30,9 @@ LOOK_S: Final = 0.1
 # A limit does not grow above so many times what is sent.
 MOST_PER_OFFERED: Final = 1.25
 # A link with a long round trip may be slow. It begins with little. The limit grows faster until something is queued for
-# the first time, and faster still while more is sent than the limit: candidates always go.
+# the first time, and while more is sent than the limit: candidates always go.
 FIRST_BYTES_PER_S: Final = 8000.0
 FIRST_MORE_PER_S: Final = 0.15
-BACK_MORE_PER_S: Final = 0.3
 # JSON is compressed on the way, how much so is not known: so many bytes of messages are in one that was acknowledged.
 MOST_PER_ACKED: Final = 1.5
 LEAST_PER_ACKED: Final = 0.8
@@ -278,22 +277,21 @@ class LinkBudget:
                 self._set_limit(max(less * used, least), now_s)
         elif limit is not None and queued_s < QUEUED_S:
             if since_s > AGAIN_S:
-                often = BACK_MORE_PER_S if offered_rate > limit else MORE_PER_S
-                more_per_s = often if self._is_slow else FIRST_MORE_PER_S
+                more_per_s = MORE_PER_S if self._is_slow and offered_rate <= limit else FIRST_MORE_PER_S
                 most = max(MOST_PER_OFFERED * offered_rate, limit)
                 self._limit = min(limit * (1.0 + more_per_s * (now_s - self._seen[-2][0])), most)
             if now_s - max(self._shed_s, self._reduced_s) > LIFT_S and offered_rate > LIFT_SHARE * limit:
                 self._limit, self._is_slow, self._was_lifted = None, False, True
 
     def _queued_s(self) -> float:
-        """Return how long what is sent waits in a modem; QUEUED_S where that is not known."""
+        """Return how long what is sent waits in a modem; QUEUED_S or more where that is not known."""
         begin, state = self._seen[0][2], self._seen[-1][2]
         if self._delay.least_s is not None:
             return self._delay.least_s - state.min_rtt_s
-        # Behind a long queue every delay is one over a loss. The smoothed round trip shows it, though not a short one:
-        # it is a mean, and above the shortest on any way.
-        queued_s = state.rtt_s - state.min_rtt_s
-        return queued_s if queued_s > LONG_QUEUE_S and state.acked > begin.acked else QUEUED_S
+        if state.acked == begin.acked:
+            return QUEUED_S
+        # Behind a long queue every delay is one over a loss. The smoothed round trip is late, but it remains.
+        return max(state.rtt_s - state.min_rtt_s, QUEUED_S)
 
     def _reduce(self, now_s: float) -> None:
         begin_s, offered, state = self._seen[0]

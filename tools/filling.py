@@ -11,6 +11,7 @@ import logging
 import threading
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -31,8 +32,9 @@ log = logging.getLogger(__name__)
 ANSWER_S: Final = 10.0
 PAUSE_S: Final = 0.1
 AGAIN_S: Final = 2.0
-# Each may be a second of a node; the oldest are given up.
+# Of a node. Each may be a second; the oldest are given up.
 MAX_GAPS: Final = 20_000
+MAX_NODES: Final = 1000
 # Of one gap in the digests, which may state any time; what is older is not asked for.
 MOST_MISSING_NS: Final = 24 * 3600 * S_NS
 # Seconds that one question is about, at most: less is packed, and on a long link waited, than for each on its own.
@@ -60,9 +62,10 @@ class _Second(NamedTuple):
 
 
 class Filler:
-    """Asks for what is missing, in a thread of its own. began_ns: what is older is not asked for.
+    """Asks for what is missing, each node in a thread of its own: a slow link is full, or a node silent, for itself.
 
-    write: takes what was missing. open: what has not come so far. filled: how many messages have come, by node.
+    began_ns: what is older is not asked for. write: takes what was missing, in several threads. open: what has not come
+    so far. filled: how many messages have come, by node.
     """
 
     def __init__(self, bus: Bus, write: Write, began_ns: int, stop: threading.Event) -> None:
@@ -71,15 +74,14 @@ class Filler:
         self._write = write
         self._began_ns = began_ns - round(CACHE_S * S_NS)
         self._stop = stop
-        self._open: OrderedDict[_Second, list[Discrepancy]] = OrderedDict()
-        self._joined = 1
+        self._open: dict[str, OrderedDict[_Second, list[Discrepancy]]] = {}
         self._changed = threading.Condition()
 
     @property
     def open(self) -> list[Discrepancy]:
         """What is missing still."""
         with self._changed:
-            return [one for found in self._open.values() for one in found]
+            return [one for of_node in self._open.values() for found in of_node.values() for one in found]
 
     def want(self, one: Discrepancy) -> None:
         """Ask for what is missing, when its turn has come."""
@@ -89,43 +91,50 @@ class Filler:
         end_ns = one.until_ns
         since_ns = max(one.since_ns, self._began_ns, end_ns - MOST_MISSING_NS)
         with self._changed:
+            of_node = self._open.setdefault(one.node, OrderedDict())
             while since_ns < end_ns:
                 until_ns = min(since_ns + MOST_NS - WRITTEN_NS, end_ns)
-                self._open.setdefault(_Second(one.node, one.boot, since_ns, until_ns), []).append(one)
+                of_node.setdefault(_Second(one.node, one.boot, since_ns, until_ns), []).append(one)
                 since_ns = until_ns
-            while len(self._open) > MAX_GAPS:
-                self._open.popitem(last=False)
-            self._changed.notify()
+            while len(of_node) > MAX_GAPS:
+                of_node.popitem(last=False)
+            self._changed.notify_all()
 
     def run(self) -> None:
-        """Ask until stopped, the oldest first; what is not answered goes to the end."""
-        failed = 0
+        """Ask until stopped. Raises what a node's thread has raised; all others are then stopped."""
+        asking: dict[str, Future[None]] = {}
+        with ThreadPoolExecutor(MAX_NODES) as threads:
+            try:
+                while not self._stop.is_set():
+                    with self._changed:
+                        for node in self._open.keys() - asking.keys():
+                            asking[node] = threads.submit(self._run, self._open[node])
+                        self._changed.wait(AGAIN_S)
+                    for one in asking.values():
+                        if one.done():
+                            one.result()
+            finally:
+                self._stop.set()
+
+    def _run(self, of_node: OrderedDict[_Second, list[Discrepancy]]) -> None:
+        """Ask a node until stopped, the oldest first; what is not answered goes to the end."""
+        failed, most = 0, 1
         while not self._stop.is_set():
             with self._changed:
-                if not self._open:
+                if not of_node:
                     self._changed.wait(AGAIN_S)
                     continue
-                asked = self._next()
+                asked = _next(of_node, most)
             left = self._fill(asked)
             with self._changed:
                 for second, missing in left.items():
-                    self._open.setdefault(second, []).extend(missing)
+                    of_node.setdefault(second, []).extend(missing)
                 failed = failed + 1 if left else 0
-                waiting = len(self._open)
+                waiting = len(of_node)
             # A shorter answer may come where a long one does not.
-            self._joined = max(self._joined // 2, 1) if left else min(2 * self._joined, MOST_JOINED)
+            most = max(most // 2, 1) if left else min(2 * most, MOST_JOINED)
             # With nothing but failures, all gaps are tried again in turn, slowly.
             self._stop.wait(AGAIN_S if failed >= max(min(waiting, 10), 1) else PAUSE_S)
-
-    def _next(self) -> dict[_Second, list[Discrepancy]]:
-        """Take the oldest second, and the ones of its node that follow on it."""
-        taken = [next(iter(self._open))]
-        for one in islice(self._open, 1, MAX_LOOK):
-            # Where digests are missing, nothing else is asked for.
-            alone = any(missing.stretch is None for missing in (*self._open[one], *self._open[taken[0]]))
-            if one.follows(taken[-1]) and not alone and len(taken) < self._joined:
-                taken.append(one)
-        return {one: self._open.pop(one) for one in taken}
 
     def _fill(self, asked: dict[_Second, list[Discrepancy]]) -> dict[_Second, list[Discrepancy]]:
         """Return what is missing after an attempt."""
@@ -149,6 +158,17 @@ class Filler:
                 if chosen is None:
                     left.setdefault(second, []).append(one)
         return left
+
+
+def _next(of_node: OrderedDict[_Second, list[Discrepancy]], most: int) -> dict[_Second, list[Discrepancy]]:
+    """Take the oldest second, and those that follow on it, so many at most."""
+    taken = [next(iter(of_node))]
+    for one in islice(of_node, 1, MAX_LOOK):
+        # Where digests are missing, nothing else is asked for.
+        alone = any(missing.stretch is None for missing in (*of_node[one], *of_node[taken[0]]))
+        if one.follows(taken[-1]) and not alone and len(taken) < most:
+            taken.append(one)
+    return {one: of_node.pop(one) for one in taken}
 
 
 def _digests(second: _Second, answer: LogAnswer) -> list[Logged] | None:

@@ -179,17 +179,17 @@ def send_over_losses(budget: LinkBudget, start_s: float, seconds: float, queued_
         budget.observe(lossy, now_s)
 
 
-@pytest.mark.parametrize(("queued_s", "acks", "is_cut"), [(1.0, True, True), (0.4, True, False), (1.0, False, False)])
-def test_where_every_delay_is_over_a_loss_a_long_round_trip_shows_a_queue(
-    queued_s: float, acks: bool, is_cut: bool
+@pytest.mark.parametrize(("queued_s", "acks", "share"), [(1.0, True, 0.5), (0.3, True, 0.8), (1.0, False, 1.0)])
+def test_where_every_delay_is_over_a_loss_the_round_trip_shows_a_queue(
+    queued_s: float, acks: bool, share: float
 ) -> None:
-    """A round trip is a mean: a little above the shortest it shows nothing. Nor does a stale one, of a cut link."""
+    """Of a link that is cut it is stale, and shows nothing."""
     budget = LinkBudget()
     run(1e6, 5.0, budget, modem_bytes=1e6)
     limit = budget.bytes_per_s or 0.0
     assert limit > 0.0
     send_over_losses(budget, 5.0, 3.0, queued_s, acks=acks)
-    assert budget.bytes_per_s == pytest.approx(0.5 * limit if is_cut else limit)
+    assert budget.bytes_per_s == pytest.approx(share * limit)
 
 
 def test_a_lifted_link_that_rests_gets_no_small_limit_by_the_delays_of_others() -> None:
@@ -221,14 +221,14 @@ def test_a_limit_is_not_lifted_while_a_queue_stands() -> None:
     assert budget.bytes_per_s == limit
 
 
-def test_a_limit_grows_slowly_at_first_and_faster_below_what_is_always_sent() -> None:
+def test_a_limit_grows_by_15_percent_a_second_at_first_and_below_what_is_always_sent() -> None:
     budget = LinkBudget()
     run(1e6, 8.0, budget, modem_bytes=1e6)
     assert FIRST_BYTES_PER_S * 1.15**5 < (budget.bytes_per_s or 0.0) < FIRST_BYTES_PER_S * 1.15**7
     send_over_losses(budget, 8.0, 20.0, 1.0)
     assert budget.bytes_per_s == 1000.0
     run(1e6, 8.0, budget, start_s=28.0, modem_bytes=1e6)
-    assert (budget.bytes_per_s or 0.0) > 1000.0 * 1.3**5
+    assert (budget.bytes_per_s or 0.0) > 1000.0 * 1.15**5
 
 
 def test_a_burst_does_not_raise_a_budget_at_once() -> None:

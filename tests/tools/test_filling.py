@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,7 @@ from buddyline.tools.authenticity import check_logs
 from buddyline.tools.filling import MOST_MISSING_NS, WRITTEN_NS, Filler
 from buddyline.tools.record import Recording
 
-from tests.processes import until
+from tests.processes import PATIENCE_S, until
 from tests.protocol.test_digest import BEGAN_NS, Line, written
 
 LATER_NS = 50_000
@@ -128,6 +129,53 @@ def test_a_recording_is_filled(tmp_path: Path, lost: str) -> None:
         assert len(recorded) == len(lines) + went_on
         told = check_logs([reader], None)
     assert told[0].startswith(f"{tmp_path}/top.mcap: node a: 6 s are as the node wrote them")
+
+
+def test_a_node_that_does_not_answer_holds_up_no_other() -> None:
+    network = LocalNetwork()
+    node, topside = network.connect(), network.connect()
+    stop, a_asked, b_asked, may_answer = (threading.Event() for _ in range(4))
+
+    def late(_: str) -> Iterator[bytes]:
+        a_asked.set()
+        may_answer.wait(PATIENCE_S)
+        yield from ()
+
+    def none(_: str) -> Iterator[bytes]:
+        b_asked.set()
+        yield from ()
+
+    node.answer(LOG.format(node="a"), late)
+    node.answer(LOG.format(node="b"), none)
+    filler = Filler(topside, lambda *_: None, BEGAN_NS, stop)
+    worker = threading.Thread(target=filler.run)
+    worker.start()
+    filler.want(Discrepancy("a", "missing", BEGAN_NS, BEGAN_NS + S_NS, "1 digests are missing", "x"))
+    assert a_asked.wait(PATIENCE_S)
+    filler.want(Discrepancy("b", "missing", BEGAN_NS, BEGAN_NS + S_NS, "1 digests are missing", "x"))
+    try:
+        assert b_asked.wait(PATIENCE_S)
+        assert not may_answer.is_set()
+    finally:
+        stop.set()
+        may_answer.set()
+        worker.join()
+
+
+def test_what_goes_wrong_while_one_node_is_asked_is_told() -> None:
+    topside = LocalNetwork().connect()
+    filler = Filler(topside, lambda *_: None, BEGAN_NS, threading.Event())
+    for node in "ab":
+        filler.want(Discrepancy(node, "missing", BEGAN_NS, BEGAN_NS + S_NS, "1 digests are missing", "x"))
+
+    def broken(key: str, *_: object) -> list[bytes]:
+        if key == LOG.format(node="b"):
+            return []
+        raise RuntimeError("broken")
+
+    topside.ask = broken  # type: ignore[method-assign]
+    with pytest.raises(RuntimeError, match="broken"):
+        filler.run()
 
 
 def test_a_digest_of_centuries_ahead_asks_for_a_day() -> None:
