@@ -19,7 +19,7 @@ AGAIN_S: Final = 1.0
 LESS: Final = 0.8
 MORE_PER_S: Final = 0.03
 # Before anything waits here, what is queued in a modem delays the acknowledgements. By so much, a link is given no
-# more; by twice as much, it is full. The shortest of this time counts. If there is none, see `_queued_s`.
+# more; by twice as much, it is full. The shortest of this time counts; if there is none, `_queued_s` tells.
 QUEUED_S: Final = 0.1
 LEAST_OVER_S: Final = 1.0
 # Behind a longer queue candidates come too late: the link is then given half.
@@ -290,7 +290,7 @@ class LinkBudget:
             return self._delay.least_s - state.min_rtt_s
         if state.acked == begin.acked:
             return QUEUED_S
-        # Behind a long queue every delay is one over a loss. The smoothed round trip is late, but it remains.
+        # Behind a long queue every delay is one over a loss. The smoothed round trip still shows the queue, if late.
         return max(state.rtt_s - state.min_rtt_s, QUEUED_S)
 
     def _reduce(self, now_s: float) -> None:

@@ -19,7 +19,7 @@ from buddyline.protocol.bus import CACHE_S
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.codec import payload_stamp_ns
 from buddyline.protocol.digest import end_of, sum_of
-from buddyline.protocol.digest_check import Discrepancy
+from buddyline.protocol.digest_check import MAX_NODES, Discrepancy
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.log_pages import MOST_NS, LogAnswer, Logged, Question, answer_of
 from buddyline.protocol.topics import DIGEST, LOG
@@ -32,9 +32,8 @@ log = logging.getLogger(__name__)
 ANSWER_S: Final = 10.0
 PAUSE_S: Final = 0.1
 AGAIN_S: Final = 2.0
-# Of a node. Each may be a second; the oldest are given up.
+# Of all nodes. Each may be a second. The oldest are given up, of the node that has most.
 MAX_GAPS: Final = 20_000
-MAX_NODES: Final = 1000
 # Of one gap in the digests, which may state any time; what is older is not asked for.
 MOST_MISSING_NS: Final = 24 * 3600 * S_NS
 # Seconds that one question is about, at most: less is packed, and on a long link waited, than for each on its own.
@@ -62,7 +61,7 @@ class _Second(NamedTuple):
 
 
 class Filler:
-    """Asks for what is missing, each node in a thread of its own: a slow link is full, or a node silent, for itself.
+    """Asks for what is missing, each node in a thread of its own: a node that is slow or silent holds up no other.
 
     began_ns: what is older is not asked for. write: takes what was missing, in several threads. open: what has not come
     so far. filled: how many messages have come, by node.
@@ -96,8 +95,8 @@ class Filler:
                 until_ns = min(since_ns + MOST_NS - WRITTEN_NS, end_ns)
                 of_node.setdefault(_Second(one.node, one.boot, since_ns, until_ns), []).append(one)
                 since_ns = until_ns
-            while len(of_node) > MAX_GAPS:
-                of_node.popitem(last=False)
+            for _ in range(sum(map(len, self._open.values())) - MAX_GAPS):
+                max(self._open.values(), key=len).popitem(last=False)
             self._changed.notify_all()
 
     def run(self) -> None:

@@ -21,7 +21,7 @@ from buddyline.protocol.messages import Depth
 from buddyline.protocol.recorder import Recorder
 from buddyline.protocol.topics import LOG, key_of
 from buddyline.tools.authenticity import check_logs
-from buddyline.tools.filling import MOST_MISSING_NS, WRITTEN_NS, Filler
+from buddyline.tools.filling import MAX_GAPS, MOST_MISSING_NS, WRITTEN_NS, Filler
 from buddyline.tools.record import Recording
 
 from tests.processes import PATIENCE_S, until
@@ -176,6 +176,17 @@ def test_what_goes_wrong_while_one_node_is_asked_is_told() -> None:
     topside.ask = broken  # type: ignore[method-assign]
     with pytest.raises(RuntimeError, match="broken"):
         filler.run()
+
+
+def test_absurd_digests_of_many_nodes_cost_their_own_gaps() -> None:
+    filler = Filler(LocalNetwork().connect(), lambda *_: None, BEGAN_NS, threading.Event())
+    filler.want(Discrepancy("own", "missing", BEGAN_NS, BEGAN_NS + S_NS, "1 digests are missing", "x"))
+    each = math.ceil(MOST_MISSING_NS / (MOST_NS - WRITTEN_NS))
+    for k in range(math.ceil(MAX_GAPS / each) + 2):
+        filler.want(Discrepancy(f"n{k}", "missing", BEGAN_NS, 2**63 - 1, "1 digests are missing", "x"))
+    nodes = [one.node for one in filler.open]
+    assert len(nodes) == MAX_GAPS
+    assert nodes.count("own") == 1
 
 
 def test_a_digest_of_centuries_ahead_asks_for_a_day() -> None:
