@@ -136,8 +136,8 @@ def solved(seed: int, args: argparse.Namespace) -> list[TrackDive]:
     ]
 
 
-def main() -> int:
-    """Run as a program."""
+def parser() -> argparse.ArgumentParser:
+    """Return the program's options."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(9300, 9306)))
     parser.add_argument("--waters", nargs="+", choices=ENVIRONMENTS, default=["cavern", "basin", "lake"])
@@ -150,7 +150,12 @@ def main() -> int:
     parser.add_argument("--dark", type=float, default=0.0, metavar="SECONDS")
     parser.add_argument("--clock-ms", type=float, default=0.0)
     parser.add_argument("--gauge", type=float, default=0.0, metavar="M")
-    args = parser.parse_args()
+    return parser
+
+
+def main() -> int:
+    """Run as a program."""
+    args = parser().parse_args()
     dives: defaultdict[str, list[TrackDive]] = defaultdict(list)
     for seed in args.seeds:
         for dive in solved(seed, args):

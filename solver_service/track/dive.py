@@ -14,6 +14,7 @@ from buddyline.protocol.clock import S_NS
 from buddyline.solver_service.track.earlier import EARLIER_S, EarlierFilter
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
+from buddyline.solver_service.track.guessing import GuessedMotion
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.parts import (
@@ -110,10 +111,10 @@ def smooth(
         said = f"{first.both}: their clocks seem some {off_s:.2f} s apart, which cannot be told well enough: no track"
         return Smoothed([], clock_ns * 1e-9, math.inf, [*first.problems, said])
     if without:
-        # Without a gyro the offset cannot be told from the turning: no second pass from what this one has learned.
+        # Without a gyro the offset cannot be told from the turning, and is taken as it was told.
         only = _empty_filter(records, told_ns, CLOCK_WITHOUT_S)
         pass_over(only, records, fixes)
-        return replace(_smoothed(only, parts_of(only), outputs_ns), clock_sigma_s=math.inf)
+        return replace(_of_guessed_motion(records, only, outputs_ns), clock_sigma_s=math.inf)
     shares = reduce(Shares.plus, [part.shares for part in parts]).best()
     known = PassedOver(records, first.epoch_ns or 0, clock_ns, shares, Walking())
     if all(part.lone for part in parts):
@@ -238,13 +239,25 @@ def _empty_filter(records: Records, clock_ns: int, clock_sigma_s: float) -> Trac
     return track
 
 
-def _smoothed(track: TrackFilter, parts: Sequence[Estimate], outputs_ns: Sequence[int]) -> Smoothed:
-    """Smooth each part."""
-    paths = []
-    for part in parts:
-        paths.append((track, smoothed(part.steps)))
+def _of_guessed_motion(records: Records, first: TrackFilter, outputs_ns: Sequence[int]) -> Smoothed:
+    """Give the tracks of a first pass, passed over again where that settles, with nodes that have no inertial unit."""
+    found: list[tuple[TrackFilter | PathPass, Path]] = []
+    for part in parts_of(first):
+        path, guessed = smoothed(part.steps, auxiliary=True), GuessedMotion.of(part.walking)
+        # Every step of the first pass holds a covariance: both passes at once take twice the memory.
         part.steps = Trail()
-    return _rows_of(paths, outputs_ns) if paths else Smoothed([], track.clock_ns * 1e-9, math.inf, track.problems)
+        known = PassedOver(
+            records,
+            first.epoch_ns or 0,
+            first.clock_ns,
+            np.zeros((2, 2)),
+            part.walking,
+            guessed=guessed,
+            clock_sigma_s=CLOCK_WITHOUT_S,
+        )
+        again = settled(path, part.detection, part.shaking, known, sum(part.told_by), doubtful=False)
+        found.append(again or (first, path))
+    return _rows_of(found, outputs_ns) if found else Smoothed([], first.clock_ns * 1e-9, math.inf, first.problems)
 
 
 def _rows_of(passed: Sequence[tuple[TrackFilter | PathPass, Path]], outputs_ns: Sequence[int]) -> Smoothed:

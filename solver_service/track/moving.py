@@ -11,6 +11,7 @@ import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.estimate import Estimate
+from buddyline.solver_service.track.guessing import GuessedMotion
 from buddyline.solver_service.track.inputs import TrackNode
 from buddyline.solver_service.track.intake import TrackIntake
 from buddyline.solver_service.track.samples import Samples
@@ -128,13 +129,18 @@ def _padded(rows: Sequence[NDArray[Number]]) -> NDArray[Number]:
 
 
 class TrackMoves(TrackIntake):
-    """Moves estimates by the samples that have come in. unrest: how much of the guessed motion's noise is taken."""
+    """Moves estimates by the samples that have come in.
+
+    unrest: how much of the guessed motion's noise is taken. guessed: how nodes without units move, where a path has
+    told it of each step; else that is learned on the way.
+    """
 
     nodes: tuple[TrackNode, TrackNode]
 
     def __init__(self, nodes: tuple[TrackNode, TrackNode]) -> None:
         super().__init__(nodes)
         self.unrest = 1.0
+        self.guessed: GuessedMotion | None = None
 
     def increments(self, estimate: Estimate, t_s: float) -> Increments:
         """Integrate both nodes from the estimate's time to t_s."""
@@ -148,12 +154,15 @@ class TrackMoves(TrackIntake):
 
     def _noises(self, estimate: Estimate, t_s: float) -> tuple[Noise, Noise]:
         gyro, accel, push, rate, wander = estimate.walking.densities.tolist()
+        rates = (rate, rate)
+        if self.guessed is not None:
+            push, *rates = self.guessed.at(t_s).tolist()
         noises = []
         for node in (0, 1):
             noise = self.samples[node].noise(t_s).scaled(self.unrest)
             noise = replace(noise, gyro_bias_radps=gyro, accel_bias_mps2=accel)
             if estimate.without[node]:
-                noise = replace(noise, gap_accel_mps=push, gap_rate_radps=rate)
+                noise = replace(noise, gap_accel_mps=push, gap_rate_radps=rates[node])
                 stated = self.turning[node].stated(t_s)
                 if stated is not None:
                     tilt, heading = stated
@@ -242,7 +251,7 @@ class TrackMoves(TrackIntake):
 
         A diver who looks away turns within tenths of a second as he has not for minutes: attitude messages say so.
         """
-        near = self.turning[node].at(to_s, to_s + HOLD_S) if estimate.without[node] else None
+        near = self.turning[node].at(to_s, to_s + HOLD_S) if estimate.without[node] and self.guessed is None else None
         if near is None:
             return noise
         R_level_camera, variances = near

@@ -20,6 +20,7 @@ from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.ahead import told_steps
 from buddyline.solver_service.track.association import Association
 from buddyline.solver_service.track.estimate import Estimate
+from buddyline.solver_service.track.guessing import GuessedMotion
 from buddyline.solver_service.track.lamps import LampWatch
 from buddyline.solver_service.track.lights import Sight, in_picture, pixel_of
 from buddyline.solver_service.track.moving import HOLD_S
@@ -37,7 +38,7 @@ from buddyline.solver_service.track.seeing import (
 )
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.smoother import Path, smoothed
-from buddyline.solver_service.track.start import broad_start, constants_of
+from buddyline.solver_service.track.start import CLOCK_S, broad_start, constants_of
 from buddyline.solver_service.track.state import MOVING, NAV, R_, State
 from buddyline.solver_service.track.stepping import DEPTH_GATE, TrackSteps
 from buddyline.solver_service.track.strapdown import (
@@ -62,6 +63,10 @@ PASSES: Final = 12
 STAYS_SIGMAS: Final = 1.0
 DOUBTFUL_SIGMAS: Final = 0.3
 LOOKED_AT: Final = 10
+# Where motion is guessed, a dive is passed over so often at least, for each pass learns more of it; and the last one
+# takes this share of the first one's lights. By the whole dive it should take more, unless it has gone astray.
+GUESSING_PASSES: Final = 3
+GUESSING_TOLD: Final = 0.95
 UNFIT: Final = 1.5
 LEAST_TOLD: Final = 0.5
 # Where a dive's passes have settled with the clocks so far and so many sigmas off what they assumed, the dive is passed
@@ -78,7 +83,8 @@ class PassedOver:
     """What a first pass has told of a dive, beside its path.
 
     epoch_ns: of the path's times. clock_ns: how far B's clock is believed ahead. shares (2, 2): as `take_off` takes
-    them. walking: how far biases walk. unrest: as in TrackMoves.
+    them. walking: how far biases walk. unrest, guessed: as in TrackMoves; guessed is learned anew from pass to pass.
+    clock_sigma_s: 1 sd of the clocks' offset.
     """
 
     records: Records
@@ -87,6 +93,8 @@ class PassedOver:
     shares: Floats
     walking: Walking
     unrest: float = 1.0
+    guessed: GuessedMotion | None = None
+    clock_sigma_s: float = CLOCK_S
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,15 +123,16 @@ class PathPass(TrackSteps):
 
     def __init__(self, known: PassedOver, path: Path, detection: Floats, shaking: Shaking) -> None:
         super().__init__((known.records[0].node, known.records[1].node), keep_s=math.inf)
-        self.epoch_ns, self.clock_ns, self.unrest = known.epoch_ns, known.clock_ns, known.unrest
+        self.epoch_ns, self.clock_ns = known.epoch_ns, known.clock_ns
+        self.unrest, self.guessed = known.unrest, known.guessed
         self.take_off(known.shares)
         self.lamps = LampWatch()
         self.guide_by(path)
         first, start_s = path.state(0), float(path.t_s[0])
         # Constants are believed as at first, whatever a pass before made of the same lights.
-        told, _ = constants_of(self.nodes, first.R, first.r_m)
+        told, _ = constants_of(self.nodes, first.R, first.r_m, known.clock_sigma_s)
         place_m = BROAD_SHARE * float(np.linalg.norm(first.r_m))
-        _, P = broad_start(self.nodes, first, shaking=shaking, place_m=place_m)
+        _, P = broad_start(self.nodes, first, known.clock_sigma_s, shaking=shaking, place_m=place_m)
         self.passed = Estimate(
             start_s,
             first,
@@ -295,7 +304,8 @@ def settled(
 ) -> tuple[PathPass, Path] | None:
     """Pass over a dive about the last pass's path until that does not move; None where it does not settle.
 
-    told: the pictures that the first pass used. doubtful: whether the path may be far off throughout.
+    told: the pictures that the first pass used. doubtful: whether the path may be far off throughout. Where motion is
+    guessed, each pass has what its path tells of it.
     """
     start_ns, end_ns = (known.epoch_ns + round(t_s * 1e9) for t_s in (path.t_s[0], path.t_s[-1]))
     a, b = known.records
@@ -304,24 +314,30 @@ def settled(
         a.between(start_ns - S_NS, end_ns + S_NS),
         b.between(start_ns - S_NS + shift_ns, end_ns + S_NS + shift_ns),
     )
-    for _ in range(PASSES):
+    for count in range(1, PASSES + 1):
+        guesses = known.guessed is not None
+        if known.guessed is not None:
+            known = replace(known, guessed=known.guessed.relearned(path))
         track = PathPass(known, path, detection, shaking)
         pass_over(track, records, ())
         passed = track.passed
-        old, path, detection = path, smoothed(passed.steps, path), passed.detection
+        old, path, detection = path, smoothed(passed.steps, path, auxiliary=guesses), passed.detection
         # Every step holds a covariance: those of two passes take twice the memory.
         passed.steps = Trail()
         if not bool(np.isfinite(path.states).all()):
             return None
-        if _stays(old, path, DOUBTFUL_SIGMAS if doubtful else STAYS_SIGMAS):
+        learned = not guesses or count >= GUESSING_PASSES
+        if learned and _stays(old, path, DOUBTFUL_SIGMAS if doubtful else STAYS_SIGMAS):
             left_s = path.state(-1).clock_s
-            # What a doubtful track tells of the clocks is little, and less than it believes.
-            if not doubtful and max(LEFT_CLOCK_S, LEFT_SIGMAS * clock_sigma_s(path)) < abs(left_s) < LOST_CLOCK_S:
+            # What a doubtful track, or one without a gyro, tells of the clocks is little, and less than it believes.
+            tells = not doubtful and not guesses
+            if tells and max(LEFT_CLOCK_S, LEFT_SIGMAS * clock_sigma_s(path)) < abs(left_s) < LOST_CLOCK_S:
                 known, path = replace(known, clock_ns=known.clock_ns + round(left_s * 1e9)), path.later(left_s)
                 continue
-            fits = passed.surprise < UNFIT * passed.told and sum(passed.told_by) > LEAST_TOLD * told
+            least = GUESSING_TOLD if guesses else LEAST_TOLD
+            fits = passed.surprise < UNFIT * passed.told and sum(passed.told_by) > least * told
             near = np.linalg.norm(path.states[:, R_], axis=1).max() < FURTHEST_M
-            return (track, path) if near and (fits or not doubtful) else None
+            return (track, path) if near and (fits or not (doubtful or guesses)) else None
     return None
 
 

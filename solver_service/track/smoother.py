@@ -12,9 +12,22 @@ from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rot
 from buddyline.solver_service.track.lights import COLUMNS
 from buddyline.solver_service.track.output import TrackRow, rows_of
 from buddyline.solver_service.track.shaking import SHAKEN_S
-from buddyline.solver_service.track.state import CLOCK_COLUMN, MOVING, NAV, PHI, R_, ROW, SHAKE, SHOVE, SIZE, V_, State
+from buddyline.solver_service.track.state import (
+    CLOCK_COLUMN,
+    GYRO_BIAS,
+    MOVING,
+    NAV,
+    PHI,
+    R_,
+    ROW,
+    SHAKE,
+    SHOVE,
+    SIZE,
+    V_,
+    State,
+)
 from buddyline.solver_service.track.strapdown import predicted
-from buddyline.solver_service.track.trail import Look, Trail
+from buddyline.solver_service.track.trail import Look, Step, Trail
 from numpy.typing import NDArray
 
 # What rows and pictures need of a covariance: of COLUMNS, half.
@@ -27,6 +40,8 @@ _DRAWN: Final = (
     np.array([(by.start, off.start, *np.repeat(np.r_[by], 3)) for by, off in _SHAKING]),
     np.array([(by.start, off.start, *np.tile(np.r_[off], 3)) for by, off in _SHAKING]),
 )
+# What moves as nodes without units please: the velocity, and A's and B's turn rates. Their columns of the errors.
+_FREE: Final = np.eye(SIZE)[:, np.r_[V_, GYRO_BIAS[0], GYRO_BIAS[1]]]
 # So many rows are made at once.
 TOGETHER: Final = 256
 # Over so many steps a turn rate's swings are averaged.
@@ -40,7 +55,9 @@ class Path:
     t_s, light_s (N,), lights (N,), rates_radps (N, 2, 3): of the steps. states: State.row of each. halves: of the
     covariance of COLUMNS, its upper half. drawn (N, 5): variances that noise added in the step before: of A's and B's
     attitude by shaking, of both by their samples, and of the velocity by shaking. without (N, 2): which node had no
-    inertial unit in that step. oldest (SIZE, SIZE): the whole covariance at the first step.
+    inertial unit in that step. oldest (SIZE, SIZE): the whole covariance at the first step. auxiliary (N, 3, 3), where
+    it was asked for: of the step before, for the velocity and for A's and B's turn rates, the auxiliary residual's
+    square (the sum of its axes), what that is expected to be, and the variance that noise added (one axis).
     """
 
     t_s: Floats
@@ -53,6 +70,7 @@ class Path:
     without: NDArray[np.bool_]
     looks: Sequence[tuple[Look, ...]]
     oldest: Floats
+    auxiliary: Floats
 
     def __len__(self) -> int:
         """Return the number of steps."""
@@ -60,7 +78,7 @@ class Path:
 
     def after(self, earlier: Path) -> Path:
         """Give this path with an earlier one before it, whose last step is its first."""
-        columns = ("t_s", "light_s", "lights", "rates_radps", "states", "halves", "drawn", "without")
+        columns = ("t_s", "light_s", "lights", "rates_radps", "states", "halves", "drawn", "without", "auxiliary")
         both = {name: np.concatenate((getattr(earlier, name)[:-1], getattr(self, name))) for name in columns}
         return Path(**both, looks=[*earlier.looks[:-1], *self.looks], oldest=earlier.oldest)
 
@@ -93,12 +111,13 @@ class Path:
         return P
 
 
-def smoothed(steps: Trail, about: Path | None = None) -> Path:
+def smoothed(steps: Trail, about: Path | None = None, *, auxiliary: bool = False) -> Path:
     """Give the state and covariance of each step by all steps' measurements.
 
     Backward, C = P F^T (P-)^-1 with P- = F P F^T + Q; the state is off its filtered one by C (x+1 - x-), its covariance
     P + C (P+1 - P-) C^T. about: the path that these steps are linear about: errors are then taken against it, where
-    they add up exactly.
+    they add up exactly. auxiliary: whether to tell auxiliary residuals (Harvey and Koopman 1992), (P-)^-1 (x+1 - x-):
+    noise of variance q was off by q times that. Their covariance is (P-)^-1 (P- - P+1) (P-)^-1.
     """
     count = len(steps)
     looks: list[tuple[Look, ...]] = [()] * count
@@ -114,6 +133,7 @@ def smoothed(steps: Trail, about: Path | None = None) -> Path:
         without=np.empty((count, 2), dtype=bool),
         looks=looks,
         oldest=np.empty((SIZE, SIZE)),
+        auxiliary=np.zeros((count, 3, 3)),
     )
     drawn, later = np.empty((count, *_DRAWN[0].shape)), None
     # A state's row, or the error against the path.
@@ -125,12 +145,14 @@ def smoothed(steps: Trail, about: Path | None = None) -> Path:
             P_before = predicted(step.covariance, later.F, later.Q, later.walk)
             across = step.covariance.copy()
             across[:, :MOVING] = step.covariance @ later.F.T
+            error = State(here).minus(State(later.before)) if about is None else here - later.before
+            if auxiliary:
+                by_free = np.linalg.solve(P_before, _FREE).T
+                squares, expected = (by_free @ error) ** 2, ((by_free @ (P_before - P)) * by_free).sum(axis=1)
+                path.auxiliary[k + 1] = np.stack((squares, expected, _walked(later))).reshape(3, 3, 3).sum(axis=2).T
             gain = np.linalg.solve(P_before, across.T).T
-            if about is None:
-                error = State(here).minus(State(later.before))
-                here = State(step.after).plus(gain @ error).row
-            else:
-                here = step.after + gain @ (here - later.before)
+            moved = gain @ error
+            here = State(step.after).plus(moved).row if about is None else step.after + moved
             P = step.covariance + gain @ (P - P_before) @ gain.T
             P = 0.5 * (P + P.T)
         path.t_s[k], path.light_s[k], path.lights[k] = step.t_s, step.light_s, step.lights
@@ -194,6 +216,11 @@ def _rows_together(path: Path, times_s: Floats, stamps_ns: Sequence[int]) -> lis
         path.lights[near],
         np.maximum(times_s - path.light_s[near], 0.0),
     )
+
+
+def _walked(step: Step) -> Floats:
+    """Give the variances (9,) that noise added to what is free in a step, of each a third."""
+    return np.concatenate((step.Q[V_, V_].diagonal(), step.walk[GYRO_BIAS[0].start - MOVING :][:6])) / 3.0
 
 
 def _drawn(noted: Floats) -> tuple[Floats, NDArray[np.bool_]]:

@@ -12,6 +12,7 @@ from buddyline.solver_service.config import SolveConfig, track_settings
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, rotation_log
 
+from tests import track_figures
 from tests.solver_service.track.dives import EPOCH_NS
 
 
@@ -59,3 +60,20 @@ def test_live_rows_err_as_they_say_with_shaken_units() -> None:
     middle = np.median(means, axis=0)
     assert ((middle > 0.8) & (middle < 1.3)).all(), means
     assert (means < 3.0).all(), means
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("water", "seed", "least_m", "most_m", "middle_m"), [("cavern", 9334, 4, 8, 0.010), ("basin", 9343, 8, 12, 0.018)]
+)
+def test_calm_dives_with_sudden_turns_without_inertial_units(
+    water: str, seed: int, least_m: int, most_m: int, middle_m: float
+) -> None:
+    """With one walk of the turn rates for the whole dive the turns would not be believed, and rows be wrong."""
+    told = f"--inertial none --modes smooth --waters {water} --range {least_m} {most_m}"
+    [dive] = track_figures.solved(seed, track_figures.parser().parse_args(told.split()))
+    figures = dive.figures
+    assert figures.position_m.median is not None
+    assert figures.position_m.median < middle_m
+    assert figures.wrong == 0
+    assert track_figures.covered(figures) > 0.99
