@@ -53,6 +53,8 @@ CLOCK_WITHOUT_S: Final = 0.003
 # A pass that finds the clocks' offset off (`clock_left_ns`) is repeated with it, in CLOCK_ROUNDS passes at most, and
 # where the best of those that were tried has some left then, in as many more.
 CLOCK_ROUNDS: Final = 4
+# A lamp that is found less often is dark, where a track began with one lamp of each node.
+NEVER_FOUND: Final = 0.1
 # A track that began without a fix, and is carried back by more than this, is passed over until that settles.
 LATE_S: Final = 2.0
 # A track whose start is so near to the dive's is left as it is.
@@ -169,7 +171,9 @@ def _of_one_lamp_each(known: PassedOver, part: Estimate, outputs_ns: Sequence[in
     """Give the track that began with one lamp of each node, the dive's beginning with it if that settles, too."""
     path, told, shaking = smoothed(part.steps), sum(part.told_by), part.shaking.less(known.shares)
     part.steps = Trail()
-    found = settled(path, part.detection, shaking, known, told, doubtful=True)
+    # A reflection beside the lit lamp would pass for the dark one, and tell a range.
+    lit = np.where(part.detection < NEVER_FOUND, 0.0, part.detection)
+    found = settled(path, lit, shaking, known, told, doubtful=True)
     if found is None:
         names = " and ".join(record.node.name for record in known.records)
         said = f"nodes {names}: one lamp of each does not tell a track"

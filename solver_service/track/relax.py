@@ -59,7 +59,7 @@ BROAD_SHARE: Final = 0.5
 # much more than a tenth of that. Tracks that began with single lamps, or late, settle more slowly, and may settle at a
 # wrong one: there is a track where chi^2 of each residual is below UNFIT, on average, and the last pass takes
 # LEAST_TOLD of the lights of the first.
-PASSES: Final = 12
+PASSES: Final = 24
 STAYS_SIGMAS: Final = 1.0
 DOUBTFUL_SIGMAS: Final = 0.3
 LOOKED_AT: Final = 10

@@ -247,9 +247,12 @@ def told_by(
 
 
 def learn_detection(detection: Floats, inside: Sequence[bool], seen: Floats) -> None:
-    """Take into detection (2,) whether each light that should be in a picture was seen there (2,)."""
+    """Take into detection (2,) whether each light that should be in a picture was seen there (2,).
+
+    A lamp that is known not to be lit stays at 0.
+    """
     for light in (0, 1):
-        if inside[light]:
+        if inside[light] and detection[light] > 0.0:
             old = detection[light]
             detection[light] = min(max(old + 0.05 * (seen[light] - old), 0.02), 0.97)
 

@@ -12,6 +12,7 @@ from buddyline.protocol.messages import LightTruth, NodePose, Truth
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.track.lamps import LampWatch
+from buddyline.solver_service.track.seeing import learn_detection
 from buddyline.solver_service.tracking import TrackSettings
 
 from tests.solver_service.track.dives import EPOCH_NS
@@ -86,3 +87,13 @@ def test_a_lamp_that_comes_back_is_no_longer_named_and_one_false_candidate_hides
 def test_a_lamp_of_nobody_is_refused():
     with pytest.raises(BuddylineError, match="dead_lamps: 'c"):
         Scenario(dead_lamps=("c.left",))
+
+
+def test_a_lamp_that_is_known_to_be_dark_stays_so_and_others_are_learned():
+    found = np.array((0.0, 0.5))
+    for seen in ((1.0, 1.0), (0.0, 1.0)):
+        learn_detection(found, (True, True), np.array(seen))
+    assert found[0] == 0.0
+    assert found[1] > 0.5
+    learn_detection(found, (True, False), np.array((0.0, 0.0)))
+    assert found[1] > 0.5

@@ -77,3 +77,17 @@ def test_calm_dives_with_sudden_turns_without_inertial_units(
     assert figures.position_m.median < middle_m
     assert figures.wrong == 0
     assert track_figures.covered(figures) > 0.99
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [9850, 9859])
+def test_one_lamp_each_settles_and_takes_no_reflection_for_the_dark_lamps(seed: int) -> None:
+    """The first dive takes fifteen passes to settle; in the second a reflection moves beside a lit lamp."""
+    waters = "cavern night_reef lake basin day_reef"
+    told = f"--inertial poor --modes smooth --seconds 40 --dead a.left b.right --waters {waters}"
+    [dive] = track_figures.solved(seed, track_figures.parser().parse_args(told.split()))
+    figures = dive.figures
+    assert figures.samples > 700
+    assert figures.wrong == 0
+    assert figures.nees6.mean is not None
+    assert figures.nees6.mean < 1.5 * 6.0
