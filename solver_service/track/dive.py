@@ -96,7 +96,7 @@ def smooth(
     long = bool(fixes) and fixes[-1].stamp_ns - fixes[0].stamp_ns > 2 * HEAD_NS
     head_ns = (fixes[0].stamp_ns + HEAD_NS) // PIECE_NS * PIECE_NS if long else END_NS
     first, parts, clock_ns = _first_pass(records, fixes, clock_ns, head_ns)
-    if long:
+    if long and not any(map(mostly_without, parts)):
         # The dive's beginning has given the clocks' offset: what is left of the dive mostly needs no other round.
         pass_over(first, records, fixes, head_ns)
         parts = parts_of(first)

@@ -146,11 +146,11 @@ def smoothed(steps: Trail, about: Path | None = None, *, auxiliary: bool = False
             across = step.covariance.copy()
             across[:, :MOVING] = step.covariance @ later.F.T
             error = State(here).minus(State(later.before)) if about is None else here - later.before
+            solved = np.linalg.solve(P_before, np.hstack((across.T, _FREE)) if auxiliary else across.T).T
+            gain, by_free = solved[:SIZE], solved[SIZE:]
             if auxiliary:
-                by_free = np.linalg.solve(P_before, _FREE).T
                 squares, expected = (by_free @ error) ** 2, ((by_free @ (P_before - P)) * by_free).sum(axis=1)
                 path.auxiliary[k + 1] = np.stack((squares, expected, _walked(later))).reshape(3, 3, 3).sum(axis=2).T
-            gain = np.linalg.solve(P_before, across.T).T
             moved = gain @ error
             here = State(step.after).plus(moved).row if about is None else step.after + moved
             P = step.covariance + gain @ (P - P_before) @ gain.T
