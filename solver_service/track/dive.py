@@ -113,7 +113,9 @@ def smooth(
         said = f"{first.both}: their clocks seem some {off_s:.2f} s apart, which cannot be told well enough: no track"
         return Smoothed([], clock_ns * 1e-9, math.inf, [*first.problems, said])
     if without:
-        # Without a gyro the offset cannot be told from the turning, and is taken as it was told.
+        # Without a gyro the offset cannot be told from the turning, and is taken as it was told. The steps of the pass
+        # that has shown it to be small enough are needed no more.
+        del first, parts
         only = _empty_filter(records, told_ns, CLOCK_WITHOUT_S)
         pass_over(only, records, fixes)
         return replace(_of_guessed_motion(records, only, outputs_ns), clock_sigma_s=math.inf)
@@ -261,7 +263,11 @@ def _of_guessed_motion(records: Records, first: TrackFilter, outputs_ns: Sequenc
         )
         again = settled(path, part.detection, part.shaking, known, sum(part.told_by), doubtful=False)
         found.append(again or (first, path))
-    return _rows_of(found, outputs_ns) if found else Smoothed([], first.clock_ns * 1e-9, math.inf, first.problems)
+    if not found:
+        return Smoothed([], first.clock_ns * 1e-9, math.inf, first.problems)
+    whole = _rows_of(found, outputs_ns)
+    problems = list(dict.fromkeys([*first.problems, *whole.problems]))
+    return replace(whole, problems=problems, dark=first.lamps.dark())
 
 
 def _rows_of(passed: Sequence[tuple[TrackFilter | PathPass, Path]], outputs_ns: Sequence[int]) -> Smoothed:

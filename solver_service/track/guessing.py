@@ -7,13 +7,14 @@ its own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.smoother import Path
 from buddyline.solver_service.track.walking import FIRST, Walking
+from numpy.typing import NDArray
 
 # Densities per root s before anything is learned: of the velocity (m/s), of A's and of B's turn rate (rad/s); and which
 # shares and multiples of these are taken at least and at most.
@@ -29,6 +30,8 @@ SUDDEN: Final = 3.75
 RAISED: Final = 1.5
 # What is calm is changed by so much at most from one path to the next, of its variance.
 LONGEST: Final = np.e
+# A node whose pictures have shown no light for so long, before and after, may have looked elsewhere.
+UNSEEN_S: Final = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +42,14 @@ class GuessedMotion:
     """
 
     calm: Floats
-    t_s: Floats = field(default_factory=lambda: np.zeros(1))
-    densities: Floats = field(default_factory=lambda: _FIRST[None])
+    t_s: Floats
+    densities: Floats
 
     @classmethod
     def of(cls, walking: Walking) -> GuessedMotion:
         """Begin with what a filter has learned on its way over a dive."""
-        return cls(walking.densities[_WALKS])
+        calm = walking.densities[_WALKS]
+        return cls(calm, np.zeros(1), calm[None])
 
     def at(self, t_s: float) -> Floats:
         """Give the densities (3,) of the step that ends at t_s, or after it."""
@@ -53,36 +57,52 @@ class GuessedMotion:
         return found
 
     def relearned(self, path: Path) -> GuessedMotion:
-        """Learn the densities of a path's steps, by auxiliary residuals that these densities, or the first, have left.
+        """Learn the densities of a path's steps, by the auxiliary residuals that these densities have left.
 
-        A density's square is multiplied by the ratio of the residuals' squares to what is expected: of all steps
-        for what is calm, and of the steps near where these say that motion was sudden. While a node sees no lamp it may
-        look elsewhere, and its own turning is told by its compass alone: it keeps the first value at least.
+        A density's square is multiplied by the ratio of the residuals' squares to what is expected: of all steps for
+        what is calm, and of the steps near where these say that motion was sudden. While a node sees no light it may
+        look elsewhere, and its own turning is told by its compass alone: its turn rate keeps the first value at least,
+        and while neither sees one, the velocity does. Nothing is learned of such steps for what is calm.
         """
-        squares, expected, walked = np.moveaxis(path.auxiliary * _free(path)[..., None], 2, 0)
-        spans_s = np.diff(path.t_s, prepend=-np.inf)[:, None]
-        ratio = np.clip(_ratio(squares.sum(axis=0), expected.sum(axis=0)), 1.0 / LONGEST, LONGEST)
-        calm = np.clip(self.calm * np.sqrt(ratio), LEAST, MOST)
-        # The velocity has the noise of each node that has no unit.
-        walkers = np.maximum(path.without.sum(axis=1), 1)[:, None] * (1, 0, 0) + (0, 1, 1)
-        taken = walked / (spans_s * walkers)
+        unseen = _unseen(path)
+        free = _free(path)[..., None]
+        squares, expected, walked = np.moveaxis(path.auxiliary * free, 2, 0)
+        seen = ~unseen
+        ratio = _ratio((squares * seen).sum(axis=0), (expected * seen).sum(axis=0))
+        calm = np.clip(self.calm * np.sqrt(np.clip(ratio, 1.0 / LONGEST, LONGEST)), LEAST, MOST)
+        # Both nodes' acceleration moves the velocity.
+        taken = walked / (np.diff(path.t_s, prepend=-np.inf)[:, None] * (2.0, 1.0, 1.0))
         asked = taken * _ratio(_nearby(squares), _nearby(expected))
         raised = (taken > RAISED * self.calm**2) | (asked > SUDDEN * taken)
-        densities = np.clip(np.sqrt(np.where(raised, asked, 0.0)), calm, MOST)
-        blind = _nearby(_blind(path)) > 0.0
-        densities[:, 1:] = np.where(blind, np.maximum(densities[:, 1:], _FIRST[1:]), densities[:, 1:])
-        return GuessedMotion(calm, path.t_s, densities)
+        densities = np.sqrt(np.where(raised, asked, 0.0))
+        least = np.where(unseen, np.maximum(calm, _FIRST), calm)
+        return GuessedMotion(calm, path.t_s, np.clip(densities, least, MOST))
 
 
-def _free(path: Path) -> Floats:
-    """Tell (N, 3) whether a step's velocity, and A's and B's turn rates, were free: 1 without a unit, else 0."""
-    return np.concatenate((path.without.any(axis=1, keepdims=True), path.without), axis=1).astype(np.float64)
+def _free(path: Path) -> NDArray[np.bool_]:
+    """Tell (N, 3) of which steps velocity, and A's and B's turn rates, are judged.
+
+    The velocity where both nodes have no unit: one that has adds its samples' noise. Not where a unit stops or comes
+    back, for its constants begin anew there.
+    """
+    without = path.without.copy()
+    without[1:] &= path.without[:-1]
+    return np.concatenate((without.all(axis=1, keepdims=True), without), axis=1)
 
 
-def _blind(path: Path) -> Floats:
-    """Tell (N, 2) whether a step has a picture of A, or B, without any light of the other: 1 or 0."""
-    dark = [{look.node for look in looks if not look.chosen} for looks in path.looks]
-    return np.array([[float(node in nodes) for node in (0, 1)] for nodes in dark])
+def _unseen(path: Path) -> NDArray[np.bool_]:
+    """Tell (N, 3) in which steps no node, A, and B may have looked elsewhere: near a picture without a light, or far
+    from any with one."""
+    elsewhere = np.empty((len(path), 2), dtype=bool)
+    for node in (0, 1):
+        of_node = [[bool(look.chosen) for look in looks if look.node == node] for looks in path.looks]
+        dark = np.array([float(bool(found) and not all(found)) for found in of_node])
+        lit_s = path.t_s[[any(found) for found in of_node]]
+        after = np.searchsorted(lit_s, path.t_s)
+        ends_s = np.concatenate(((-np.inf,), lit_s, (np.inf,)))
+        away_s = np.minimum(path.t_s - ends_s[after], ends_s[after + 1] - path.t_s)
+        elsewhere[:, node] = (_nearby(dark[:, None])[:, 0] > 0.0) | (away_s > UNSEEN_S)
+    return np.concatenate((elsewhere.all(axis=1, keepdims=True), elsewhere), axis=1)
 
 
 def _ratio(squares: Floats, expected: Floats) -> Floats:

@@ -52,6 +52,7 @@ from buddyline.solver_service.track.strapdown import (
 )
 from buddyline.solver_service.track.trail import Look, Step, Trail
 from buddyline.solver_service.track.walking import Walking
+from numpy.typing import NDArray
 
 # What is believed of the place at first, 1 sd, as a share of the range.
 BROAD_SHARE: Final = 0.5
@@ -64,7 +65,8 @@ STAYS_SIGMAS: Final = 1.0
 DOUBTFUL_SIGMAS: Final = 0.3
 LOOKED_AT: Final = 10
 # Where motion is guessed, a dive is passed over so often at least, for each pass learns more of it; and the last one
-# takes this share of the first one's lights. By the whole dive it should take more, unless it has gone astray.
+# uses this share of each node's pictures that its first path used. By the whole dive it should use more, unless it has
+# gone astray.
 GUESSING_PASSES: Final = 3
 GUESSING_TOLD: Final = 0.95
 UNFIT: Final = 1.5
@@ -314,8 +316,8 @@ def settled(
         a.between(start_ns - S_NS, end_ns + S_NS),
         b.between(start_ns - S_NS + shift_ns, end_ns + S_NS + shift_ns),
     )
+    guesses, used = known.guessed is not None, _used(path)
     for count in range(1, PASSES + 1):
-        guesses = known.guessed is not None
         if known.guessed is not None:
             known = replace(known, guessed=known.guessed.relearned(path))
         track = PathPass(known, path, detection, shaking)
@@ -334,11 +336,17 @@ def settled(
             if tells and max(LEFT_CLOCK_S, LEFT_SIGMAS * clock_sigma_s(path)) < abs(left_s) < LOST_CLOCK_S:
                 known, path = replace(known, clock_ns=known.clock_ns + round(left_s * 1e9)), path.later(left_s)
                 continue
-            least = GUESSING_TOLD if guesses else LEAST_TOLD
-            fits = passed.surprise < UNFIT * passed.told and sum(passed.told_by) > least * told
+            fits = passed.surprise < UNFIT * passed.told and sum(passed.told_by) > LEAST_TOLD * told
+            fits = fits and not (guesses and (_used(path) < GUESSING_TOLD * used).any())
             near = np.linalg.norm(path.states[:, R_], axis=1).max() < FURTHEST_M
             return (track, path) if near and (fits or not (doubtful or guesses)) else None
     return None
+
+
+def _used(path: Path) -> NDArray[np.int64]:
+    """Count the pictures of A and of B (2,) in which a path uses a light."""
+    used = [look.node for looks in path.looks for look in looks if look.chosen]
+    return np.bincount(np.array(used, dtype=np.int64), minlength=2)
 
 
 def clock_sigma_s(path: Path) -> float:

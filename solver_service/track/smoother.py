@@ -117,7 +117,7 @@ def smoothed(steps: Trail, about: Path | None = None, *, auxiliary: bool = False
     Backward, C = P F^T (P-)^-1 with P- = F P F^T + Q; the state is off its filtered one by C (x+1 - x-), its covariance
     P + C (P+1 - P-) C^T. about: the path that these steps are linear about: errors are then taken against it, where
     they add up exactly. auxiliary: whether to tell auxiliary residuals (Harvey and Koopman 1992), (P-)^-1 (x+1 - x-):
-    noise of variance q was off by q times that. Their covariance is (P-)^-1 (P- - P+1) (P-)^-1.
+    by Q times that noise was off. Their covariance is (P-)^-1 (P- - P+1) (P-)^-1.
     """
     count = len(steps)
     looks: list[tuple[Look, ...]] = [()] * count
@@ -219,7 +219,7 @@ def _rows_together(path: Path, times_s: Floats, stamps_ns: Sequence[int]) -> lis
 
 
 def _walked(step: Step) -> Floats:
-    """Give the variances (9,) that noise added to what is free in a step, of each a third."""
+    """Give the variances (9,) that noise added to what is free in a step, over 3: the axes are summed."""
     return np.concatenate((step.Q[V_, V_].diagonal(), step.walk[GYRO_BIAS[0].start - MOVING :][:6])) / 3.0
 
 

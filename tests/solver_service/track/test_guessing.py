@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.track import dive as dive_module
+from buddyline.solver_service.track import relax
+from buddyline.solver_service.track.dive import smooth
+from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.guessing import LEAST, MOST, NEAR, GuessedMotion
+from buddyline.solver_service.track.moving import TrackMoves
+from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.smoother import Path, smoothed
 from buddyline.solver_service.track.state import MOVING, SIZE, V_, State
 from buddyline.solver_service.track.trail import Look, Step, Trail
 from buddyline.solver_service.track.walking import FIRST, Walking
 
+from tests.solver_service.track.dives import KnownDive, Setting, make
+
 STEP_S = 0.1
 COUNT = 60
 CALM = FIRST[[2, 3, 3]]
+LIT = Look(0, 0, 0.0, ((0, 0, 0.5),)), Look(1, 0, 0.0, ((0, 0, 0.5),))
 
 
 def filtered(seen: Floats, walk: float, noise: float) -> Trail:
@@ -67,7 +78,7 @@ def test_a_velocity_s_walk_is_found_whatever_was_believed(times: float) -> None:
 def path_of(
     auxiliary: Floats, *, without: tuple[bool, bool] = (True, True), looks: dict[int, tuple[Look, ...]] | None = None
 ) -> Path:
-    """A path of which only what is learned from is there."""
+    """A path of which only what is learned from is there; each step has a light of both nodes, unless looks differ."""
     count, nothing = len(auxiliary), np.zeros(0)
     return Path(
         t_s=STEP_S * np.arange(count),
@@ -78,10 +89,14 @@ def path_of(
         halves=nothing,
         drawn=nothing,
         without=np.tile(without, (count, 1)),
-        looks=[(looks or {}).get(k, ()) for k in range(count)],
+        looks=[(looks or {}).get(k, LIT) for k in range(count)],
         oldest=nothing,
         auxiliary=auxiliary,
     )
+
+
+def known(calm: Floats) -> GuessedMotion:
+    return GuessedMotion(calm, np.zeros(1), calm[None])
 
 
 def as_expected(densities: Floats) -> Floats:
@@ -93,21 +108,21 @@ def as_expected(densities: Floats) -> Floats:
 def test_calm_walks_grow_and_shrink_as_all_residuals_ask_within_limits() -> None:
     told = as_expected(np.tile(CALM, (COUNT, 1)))
     told[:, :, 0] *= (2.0, 0.5, 1.0)
-    found = GuessedMotion(CALM).relearned(path_of(told))
+    found = known(CALM).relearned(path_of(told))
     assert found.calm == pytest.approx(CALM * np.sqrt((2.0, 0.5, 1.0)))
     told[:, :, 0] = 0.0
-    shrunk = GuessedMotion(CALM)
+    shrunk = known(CALM)
     for _ in range(10):
         shrunk = shrunk.relearned(path_of(told))
     assert shrunk.calm == pytest.approx(LEAST)
     told[:, :, 0] = 1e6
-    assert (GuessedMotion(0.99 * MOST).relearned(path_of(told)).densities <= MOST).all()
+    assert (known(0.99 * MOST).relearned(path_of(told)).densities <= MOST).all()
 
 
 def test_a_sudden_turn_is_believed_there_alone_and_stays_believed() -> None:
     told = as_expected(np.tile(CALM, (COUNT, 1)))
     told[30, 1, 0] *= 10.0 * (2 * NEAR + 1)
-    found = GuessedMotion(CALM).relearned(path_of(told))
+    found = known(CALM).relearned(path_of(told))
     near = np.abs(np.arange(COUNT) - 30) <= NEAR
     assert (found.densities[near, 1] > 3.0 * CALM[1]).all()
     assert found.densities[~near, 1] == pytest.approx(found.calm[1])
@@ -126,17 +141,82 @@ def test_a_sudden_turn_is_believed_there_alone_and_stays_believed() -> None:
 def test_a_node_that_sees_no_lamp_may_turn_as_at_first() -> None:
     dark = Look(1, 0, 0.0, ()), Look(0, 0, 0.0, ((0, 0, 0.5),))
     path = path_of(as_expected(np.tile(LEAST, (COUNT, 1))), looks={30: dark})
-    found = GuessedMotion(LEAST).relearned(path).densities
+    found = known(LEAST).relearned(path).densities
     near = np.abs(np.arange(COUNT) - 30) <= NEAR
     assert found[near, 2] == pytest.approx(CALM[2])
     assert found[~near, 2] == pytest.approx(LEAST[2])
     assert found[:, :2] == pytest.approx(np.tile(LEAST[:2], (COUNT, 1)))
 
 
+def test_a_node_that_tells_no_picture_may_turn_as_at_first_and_both_may_swim_off() -> None:
+    """B is silent for a second; then both are for half a second."""
+    looks = {k: LIT[:1] for k in range(20, 30)} | dict.fromkeys(range(40, 50), ())
+    found = known(LEAST).relearned(path_of(as_expected(np.tile(LEAST, (COUNT, 1))), looks=looks)).densities
+    # A light just before or after still tells how a node turns.
+    assert found[23:27] == pytest.approx(np.tile((*LEAST[:2], CALM[2]), (4, 1)))
+    assert found[43:47] == pytest.approx(np.tile(CALM, (4, 1)))
+    told = [*range(22), *range(28, 42), *range(48, COUNT)]
+    assert found[told] == pytest.approx(np.tile(LEAST, (len(told), 1)))
+
+
+def test_steps_in_which_a_node_may_look_elsewhere_teach_nothing_of_the_calm_ones() -> None:
+    """Their residuals are small, for they take more noise than there is."""
+    told = as_expected(np.tile(CALM, (COUNT, 1)))
+    told[12:, 2, 0] = 0.0
+    looks = dict.fromkeys(range(8, COUNT), LIT[:1])
+    assert known(CALM).relearned(path_of(told, looks=looks)).calm == pytest.approx(CALM)
+
+
 def test_nothing_is_learned_of_a_node_that_has_a_unit() -> None:
     told = as_expected(np.tile(CALM, (COUNT, 1)))
     told[:, :, 0] *= 2.0
-    # The velocity has the noise of B alone.
-    told[:, 0, 2] *= 0.5
-    found = GuessedMotion(CALM).relearned(path_of(told, without=(False, True)))
-    assert found.calm == pytest.approx(CALM * (np.sqrt(2.0), 1.0, np.sqrt(2.0)))
+    found = known(CALM).relearned(path_of(told, without=(False, True)))
+    assert found.calm == pytest.approx(CALM * (1.0, 1.0, np.sqrt(2.0)))
+
+
+def test_each_node_turns_by_its_own_walk() -> None:
+    a, b = make(4, Setting(seconds=3.0)).records
+    moves = TrackMoves((a.node, b.node))
+    moves.guessed = GuessedMotion(CALM, np.array((0.0, 1.0)), np.array(((0.1, 0.2, 0.3), (0.4, 0.5, 0.6))))
+    estimate = Estimate(0.0, State.at_rest(np.ones(3), np.tile(np.eye(3), (2, 1, 1))), np.eye(SIZE), 0.0)
+    estimate.without = [True, True]
+    for t_s, push, rates in ((-1.0, 0.1, (0.2, 0.3)), (0.5, 0.4, (0.5, 0.6)), (2.0, 0.4, (0.5, 0.6))):
+        noises = moves._noises(estimate, t_s)
+        assert [noise.gap_accel_mps for noise in noises] == [push, push]
+        assert tuple(noise.gap_rate_radps for noise in noises) == rates
+
+
+@pytest.fixture(scope="module")
+def bare() -> KnownDive:
+    """Six seconds of two nodes without inertial units, one of whose fixes is damaged."""
+    dive = make(4, Setting(seconds=6.0, near_m=4.0, far_m=8.0))
+    none = np.zeros((0, 3))
+    empty = {"imu_stamps_ns": np.zeros(0, np.int64), "accel_mps2": none, "gyro_radps": none}
+    a, b = (replace(record, **empty) for record in dive.records)
+    damaged = replace(dive.fixes[0], t_a_b_m=np.full(3, np.nan))
+    return replace(dive, records=(a, b), fixes=[damaged, *dive.fixes])
+
+
+def test_what_the_first_pass_has_found_is_told_though_the_dive_is_passed_over_again(bare: KnownDive) -> None:
+    found = smooth(bare.records, bare.fixes, bare.stamps_ns)
+    assert any("out of numeric range" in problem for problem in found.problems)
+    assert list(found.rows)
+
+
+def test_passes_that_use_fewer_pictures_than_the_first_are_not_taken(
+    bare: KnownDive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def rows() -> list[TrackRow]:
+        return list(smooth(bare.records, bare.fixes, bare.stamps_ns).rows)
+
+    def settle_nowhere(*_: object, **__: object) -> None:
+        """No pass settles."""
+
+    again = rows()
+    monkeypatch.setattr(relax, "GUESSING_TOLD", 1.5)
+    refused = rows()
+    monkeypatch.setattr(dive_module, "settled", settle_nowhere)
+    first = rows()
+    places = [np.array([row.t_a_b_m for row in of]) for of in (again, refused, first)]
+    assert np.abs(places[1] - places[2]).max() == 0.0
+    assert np.abs(places[0] - places[2]).max() > 1e-4
