@@ -136,7 +136,7 @@ def solved(seed: int, args: argparse.Namespace) -> list[TrackDive]:
     ]
 
 
-def parser() -> argparse.ArgumentParser:
+def options() -> argparse.ArgumentParser:
     """Return the program's options."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(9300, 9306)))
@@ -155,7 +155,7 @@ def parser() -> argparse.ArgumentParser:
 
 def main() -> int:
     """Run as a program."""
-    args = parser().parse_args()
+    args = options().parse_args()
     dives: defaultdict[str, list[TrackDive]] = defaultdict(list)
     for seed in args.seeds:
         for dive in solved(seed, args):

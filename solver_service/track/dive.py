@@ -53,7 +53,7 @@ CLOCK_WITHOUT_S: Final = 0.003
 # A pass that finds the clocks' offset off (`clock_left_ns`) is repeated with it, in CLOCK_ROUNDS passes at most, and
 # where the best of those that were tried has some left then, in as many more.
 CLOCK_ROUNDS: Final = 4
-# A lamp that is found less often is dark, where a track began with one lamp of each node.
+# Where a track began with one lamp of each node, a lamp that is found in a smaller share of its pictures is dark.
 NEVER_FOUND: Final = 0.1
 # A track that began without a fix, and is carried back by more than this, is passed over until that settles.
 LATE_S: Final = 2.0
@@ -113,8 +113,8 @@ def smooth(
         said = f"{first.both}: their clocks seem some {off_s:.2f} s apart, which cannot be told well enough: no track"
         return Smoothed([], clock_ns * 1e-9, math.inf, [*first.problems, said])
     if without:
-        # Without a gyro the offset cannot be told from the turning, and is taken as it was told. The steps of the pass
-        # that has shown it to be small enough are needed no more.
+        # Without a gyro the offset cannot be told from the turning, and is taken as it was told. The first pass has
+        # shown that it is small. Its steps only take memory now.
         del first, parts
         only = _empty_filter(records, told_ns, CLOCK_WITHOUT_S)
         pass_over(only, records, fixes)
@@ -246,7 +246,10 @@ def _empty_filter(records: Records, clock_ns: int, clock_sigma_s: float) -> Trac
 
 
 def _of_guessed_motion(records: Records, first: TrackFilter, outputs_ns: Sequence[int]) -> Smoothed:
-    """Give the tracks of a first pass, passed over again where that settles, with nodes that have no inertial unit."""
+    """Give the tracks of a first pass over nodes without inertial units.
+
+    Each is passed over again. Where that does not settle, the first pass's path stands.
+    """
     found: list[tuple[TrackFilter | PathPass, Path]] = []
     for part in parts_of(first):
         path, guessed = smoothed(part.steps, auxiliary=True), GuessedMotion.of(part.walking)

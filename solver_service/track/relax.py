@@ -57,18 +57,17 @@ from numpy.typing import NDArray
 # What is believed of the place at first, 1 sd, as a share of the range.
 BROAD_SHARE: Final = 0.5
 # A dive is passed over so often at most, until a pass moves no pose by so many sigmas: the next one would move none by
-# much more than a tenth of that. Tracks that began with single lamps, or late, settle more slowly, and may settle at a
-# wrong one: there is a track where chi^2 of each residual is below UNFIT, on average, and the last pass takes
-# LEAST_TOLD of the lights of the first.
+# much more than a tenth of that. Tracks that began with single lamps, or late, settle more slowly.
 PASSES: Final = 24
 STAYS_SIGMAS: Final = 1.0
 DOUBTFUL_SIGMAS: Final = 0.3
 LOOKED_AT: Final = 10
-# Where motion is guessed, a dive is passed over so often at least, for each pass learns more of it; and the last one
-# uses this share of each node's pictures that its first path used. By the whole dive it should use more, unless it has
-# gone astray.
+# Where motion is guessed, a dive is passed over so often at least, for each pass learns more of it. The last pass must
+# use this share of the pictures that the first path used, of each node: one that uses fewer has gone astray.
 GUESSING_PASSES: Final = 3
 GUESSING_TOLD: Final = 0.95
+# A doubtful track may settle at a wrong path. There is a track where chi^2 of each residual is below UNFIT, on average,
+# and the last pass uses LEAST_TOLD of the first one's pictures.
 UNFIT: Final = 1.5
 LEAST_TOLD: Final = 0.5
 # Where a dive's passes have settled with the clocks so far and so many sigmas off what they assumed, the dive is passed

@@ -40,7 +40,7 @@ _DRAWN: Final = (
     np.array([(by.start, off.start, *np.repeat(np.r_[by], 3)) for by, off in _SHAKING]),
     np.array([(by.start, off.start, *np.tile(np.r_[off], 3)) for by, off in _SHAKING]),
 )
-# What moves as nodes without units please: the velocity, and A's and B's turn rates. Their columns of the errors.
+# The columns of the errors that change as divers like, where no unit tells: velocity, A's and B's turn rates.
 _FREE: Final = np.eye(SIZE)[:, np.r_[V_, GYRO_BIAS[0], GYRO_BIAS[1]]]
 # So many rows are made at once.
 TOGETHER: Final = 256
@@ -116,8 +116,8 @@ def smoothed(steps: Trail, about: Path | None = None, *, auxiliary: bool = False
 
     Backward, C = P F^T (P-)^-1 with P- = F P F^T + Q; the state is off its filtered one by C (x+1 - x-), its covariance
     P + C (P+1 - P-) C^T. about: the path that these steps are linear about: errors are then taken against it, where
-    they add up exactly. auxiliary: whether to tell auxiliary residuals (Harvey and Koopman 1992), (P-)^-1 (x+1 - x-):
-    by Q times that noise was off. Their covariance is (P-)^-1 (P- - P+1) (P-)^-1.
+    they add up exactly. auxiliary: whether to give auxiliary residuals (Harvey and Koopman 1992),
+    s = (P-)^-1 (x+1 - x-): the noise was off by Q s. The covariance of s is (P-)^-1 (P- - P+1) (P-)^-1.
     """
     count = len(steps)
     looks: list[tuple[Look, ...]] = [()] * count
@@ -219,7 +219,7 @@ def _rows_together(path: Path, times_s: Floats, stamps_ns: Sequence[int]) -> lis
 
 
 def _walked(step: Step) -> Floats:
-    """Give the variances (9,) that noise added to what is free in a step, over 3: the axes are summed."""
+    """Give a third of the variances (9,) that noise added to _FREE in a step: three axes together give their mean."""
     return np.concatenate((step.Q[V_, V_].diagonal(), step.walk[GYRO_BIAS[0].start - MOVING :][:6])) / 3.0
 
 

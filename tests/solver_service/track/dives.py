@@ -347,3 +347,13 @@ def fix_errors(dive: KnownDive) -> Floats:
         true = [np.interp(fix.stamp_ns - dive.stamps_ns[0], stamps, dive.t_a_b_m[:, axis]) for axis in range(3)]
         out.append(float(np.linalg.norm(fix.t_a_b_m - true)))
     return np.array(out)
+
+
+def bare_of(dive: KnownDive) -> tuple[NodeRecord, NodeRecord]:
+    """The records without inertial samples."""
+    none = np.zeros((0, 3))
+    a, b = (
+        replace(record, imu_stamps_ns=np.zeros(0, np.int64), accel_mps2=none, gyro_radps=none)
+        for record in dive.records
+    )
+    return a, b

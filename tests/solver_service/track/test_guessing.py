@@ -19,7 +19,7 @@ from buddyline.solver_service.track.state import MOVING, SIZE, V_, State
 from buddyline.solver_service.track.trail import Look, Step, Trail
 from buddyline.solver_service.track.walking import FIRST, Walking
 
-from tests.solver_service.track.dives import KnownDive, Setting, make
+from tests.solver_service.track.dives import KnownDive, Setting, bare_of, make
 
 STEP_S = 0.1
 COUNT = 60
@@ -190,11 +190,8 @@ def test_each_node_turns_by_its_own_walk() -> None:
 def bare() -> KnownDive:
     """Six seconds of two nodes without inertial units, one of whose fixes is damaged."""
     dive = make(4, Setting(seconds=6.0, near_m=4.0, far_m=8.0))
-    none = np.zeros((0, 3))
-    empty = {"imu_stamps_ns": np.zeros(0, np.int64), "accel_mps2": none, "gyro_radps": none}
-    a, b = (replace(record, **empty) for record in dive.records)
     damaged = replace(dive.fixes[0], t_a_b_m=np.full(3, np.nan))
-    return replace(dive, records=(a, b), fixes=[damaged, *dive.fixes])
+    return replace(dive, records=bare_of(dive), fixes=[damaged, *dive.fixes])
 
 
 def test_what_the_first_pass_has_found_is_told_though_the_dive_is_passed_over_again(bare: KnownDive) -> None:

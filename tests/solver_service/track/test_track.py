@@ -21,7 +21,7 @@ from buddyline.solver_service.track.smoother import Path, smoothed
 from buddyline.solver_service.track.trail import Trail
 
 from tests.solver_service.track.assignments import weigh
-from tests.solver_service.track.dives import EPOCH_NS, KnownDive, Setting, filter_of, fix_errors, make, score
+from tests.solver_service.track.dives import EPOCH_NS, KnownDive, Setting, bare_of, filter_of, fix_errors, make, score
 
 SHORT = Setting(seconds=12.0)
 
@@ -190,16 +190,6 @@ def test_lag_is_better_than_the_filter(dive: KnownDive) -> None:
     assert judged.rows > 0.8 * len(dive.stamps_ns)
     assert np.percentile(judged.errors_m, 95) < np.percentile(score(dive, causal).errors_m, 95)
     assert 0.3 < judged.nees < 2.0
-
-
-def bare_of(dive: KnownDive) -> tuple[NodeRecord, NodeRecord]:
-    """The records without inertial samples."""
-    none = np.zeros((0, 3))
-    a, b = (
-        replace(record, imu_stamps_ns=np.zeros(0, np.int64), accel_mps2=none, gyro_radps=none)
-        for record in dive.records
-    )
-    return a, b
 
 
 @pytest.mark.slow

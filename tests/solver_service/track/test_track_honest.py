@@ -71,7 +71,7 @@ def test_calm_dives_with_sudden_turns_without_inertial_units(
 ) -> None:
     """With one walk of the turn rates for the whole dive the turns would not be believed, and rows be wrong."""
     told = f"--inertial none --modes smooth --waters {water} --range {least_m} {most_m}"
-    [dive] = track_figures.solved(seed, track_figures.parser().parse_args(told.split()))
+    [dive] = track_figures.solved(seed, track_figures.options().parse_args(told.split()))
     figures = dive.figures
     assert figures.position_m.median is not None
     assert figures.position_m.median < middle_m
@@ -85,7 +85,7 @@ def test_one_lamp_each_settles_and_takes_no_reflection_for_the_dark_lamps(seed: 
     """The first dive takes fifteen passes to settle; in the second a reflection moves beside a lit lamp."""
     waters = "cavern night_reef lake basin day_reef"
     told = f"--inertial poor --modes smooth --seconds 40 --dead a.left b.right --waters {waters}"
-    [dive] = track_figures.solved(seed, track_figures.parser().parse_args(told.split()))
+    [dive] = track_figures.solved(seed, track_figures.options().parse_args(told.split()))
     figures = dive.figures
     assert figures.samples > 700
     assert figures.wrong == 0
