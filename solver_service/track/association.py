@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, islice
 from typing import Final, TypeAlias
@@ -12,8 +12,10 @@ import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
 from numpy.typing import NDArray
 
-# A light is used where its marginal probability is above this.
+# A light is used where its marginal probability is above SURE; by a track that is confirmed above LIKELY, with the
+# doubt in its variance.
 SURE: Final = 0.99
+LIKELY: Final = 0.8
 # Share of lights found wrongly by many pixels (flares, half-hidden lights), and how far, 1 sd.
 GROSS_SHARE: Final = 0.03
 GROSS_PX: Final = 7.0
@@ -22,6 +24,8 @@ GATE: Final = 27.6
 MAX_OPTIONS: Final = 10
 # The residual of a light behind the camera.
 NOWHERE_PX: Final = 1e8
+IN_PICTURE: Final[Floats] = np.ones(2)
+"""That both lights are surely within the picture."""
 _LOG_SHARES: Final = np.log((1.0 - GROSS_SHARE, GROSS_SHARE))
 
 Case: TypeAlias = tuple[tuple[int, int] | None, tuple[int, int] | None]
@@ -33,9 +37,9 @@ _Option: TypeAlias = tuple[float, int, int]
 class Association:
     """What one picture says of the lights.
 
-    chosen: (candidate, light, variance in px^2) of those that are sure; the variance is that of the mixture where a
-    gross error cannot be told from a common one. seen (L,): the probability that each light is among the
-    candidates. evidence: log of the picture's probability over that of clutter alone.
+    chosen: (candidate, light, variance in px^2) of those that are sure or likely; the variance is that of the mixture
+    where a gross error cannot be told from a common one, or the light may be elsewhere. seen (L,): the probability that
+    each light is among the candidates. evidence: log of the picture's probability over that of clutter alone.
     """
 
     chosen: tuple[tuple[int, int, float], ...]
@@ -47,28 +51,39 @@ class Association:
 class Odds:
     """Every assignment of one picture's candidates, and the logs (N,) of their densities over clutter.
 
-    How likely each light is found is left out: that is learned from picture to picture.
+    How likely each light is found is left out: that is learned from picture to picture. y_px (K, 2, 2): how far each
+    candidate stands off each light; spread_px2 (K, 2): how far it may, by what is predicted, as a mean square.
     """
 
     cases: list[Case]
     logs: Floats
+    y_px: Floats
+    spread_px2: Floats
 
-    def weighed(self, detection: Floats) -> tuple[list[Case], Floats]:
-        """Give the assignments and the logs of their odds by how likely each light (2,) is found."""
+    def weighed(self, detection: Floats, within: Floats = IN_PICTURE) -> tuple[list[Case], Floats]:
+        """Give the assignments and the logs of their odds.
+
+        within (2,): how likely each light is within the picture; detection (2,): how likely it is found there.
+        """
         cases, logs = self.cases, self.logs
         if not detection.all():
             lit = detection.tolist()
             kept = [n for n, case in enumerate(cases) if all(lit[k] or one is None for k, one in enumerate(case))]
             cases, logs = [cases[n] for n in kept], logs[kept]
         first, second = (
-            (math.log(max(1.0 - found, 1e-6)), math.log(found) if found > 0.0 else -math.inf)
-            for found in detection.tolist()
+            (math.log(max(1.0 - found * inside, 1e-6)), math.log(found) if found > 0.0 else -math.inf)
+            for found, inside in zip(detection.tolist(), within.tolist(), strict=True)
         )
         return cases, logs + [first[one is not None] + second[two is not None] for one, two in cases]
 
-    def associate(self, sigma_px: Floats, detection: Floats) -> Association:
-        """Choose the lights that are sure. sigma_px (K,): of the candidates, for the variance of the chosen."""
-        cases, logs = self.weighed(detection)
+    def associate(
+        self, sigma_px: Floats, detection: Floats, within: Floats = IN_PICTURE, least: float = SURE
+    ) -> Association:
+        """Choose the lights that are more likely than least.
+
+        sigma_px (K,): of the candidates, for the variance of the chosen. detection, within: as of `weighed`.
+        """
+        cases, logs = self.weighed(detection, within)
         top = float(logs.max())
         weights = np.exp(logs - top)
         total = float(weights.sum())
@@ -82,21 +97,43 @@ class Odds:
                     marginal.setdefault((picked[0], light), [0.0, 0.0])[picked[1]] += weight
         chosen: list[tuple[int, int, float]] = []
         for (k, light), (common, gross) in sorted(marginal.items()):
-            if common + gross > SURE:
-                chosen.append((k, light, variance_of(float(sigma_px[k]), common, gross)))
+            if common + gross > least:
+                doubt_px2 = 0.0 if common + gross > SURE else self._doubt_px2(k, light, marginal)
+                chosen.append((k, light, variance_of(float(sigma_px[k]), common, gross) + doubt_px2))
         return Association(tuple(chosen), np.array(seen), top + math.log(total))
+
+    def _doubt_px2(self, k: int, light: int, marginal: Mapping[tuple[int, int], Sequence[float]]) -> float:
+        """Give what the variance of a light, candidate k, gains because it may be another candidate or none.
+
+        That is the mixture's mean square about k; a light that is none of them is where it was predicted. One variance
+        stands poorly for places far apart, so it is the prediction's at least: such a light tells no more than what is
+        known already.
+        """
+        y = self.y_px[k, light]
+        odds = {other: sum(found) for (other, of), found in marginal.items() if of == light}
+        apart_px2 = sum(share * float(((self.y_px[other, light] - y) ** 2).sum()) for other, share in odds.items())
+        missing = max(1.0 - sum(odds.values()), 0.0)
+        return apart_px2 + missing * float(y @ y) + 0.5 * float(self.spread_px2[k, light])
 
 
 def associate(
-    y: Floats, H: Floats, P: Floats, sigma_px: Floats, detection: Floats, clutter_per_px2: float
+    y: Floats,
+    H: Floats,
+    P: Floats,
+    sigma_px: Floats,
+    detection: Floats,
+    clutter_per_px2: float,
+    within: Floats = IN_PICTURE,
+    least: float = SURE,
 ) -> Association:
     """Weigh every assignment of candidates (K) to two lights, each of which may be missing.
 
     y (K, 2, 2), H (K, 2, 2, C): residuals and Jacobians, by candidate and light; P (C, C): covariance of the errors.
-    detection (2,): how likely each light is to be among the candidates. The odds are against clutter alone.
+    within (2,): how likely each light is within the picture; detection (2,): how likely it is then among the
+    candidates. The odds are against clutter alone. least: lights that are more likely are chosen.
     """
     [odds] = odds_of(y[None], H[None], P[None], sigma_px[None], np.array((clutter_per_px2,)))
-    return odds.associate(sigma_px, detection)
+    return odds.associate(sigma_px, detection, within, least)
 
 
 def variance_of(sigma_px: float, common: float, gross: float) -> float:
@@ -114,7 +151,7 @@ def odds_of(y: Floats, H: Floats, P: Floats, sigma_px: Floats, clutter_per_px2: 
     y = np.where(np.isfinite(y), y, NOWHERE_PX)
     log_clutter = np.log(clutter_per_px2) + math.log(2.0 * math.pi)
     variances = np.array((0.0, GROSS_PX**2))[:, None] + (sigma_px * sigma_px)[:, None]  # (N, 2 modes, K)
-    options = _single(y, H, P, variances, log_clutter)
+    options, spread_px2 = _single(y, H, P, variances, log_clutter)
     pairs = [[(one[1:], two[1:]) for one in first for two in second if one[1] != two[1]] for first, second in options]
     counts = list(map(len, pairs))
     joint: Iterator[float] = iter(())
@@ -122,17 +159,17 @@ def odds_of(y: Floats, H: Floats, P: Floats, sigma_px: Floats, clutter_per_px2: 
         at, picked = np.repeat(np.arange(len(pairs)), counts), np.array([pair for found in pairs for pair in found])
         joint = iter(_both(at, picked, y, H, P, variances, log_clutter))
     every = []
-    for (first, second), found in zip(options, pairs, strict=True):
+    for (first, second), found, *of_picture in zip(options, pairs, y, spread_px2, strict=True):
         cases: list[Case] = [(None, None), *((one[1:], None) for one in first), *((None, two[1:]) for two in second)]
         logs = [0.0, *(one[0] for one in first), *(two[0] for two in second), *islice(joint, len(found))]
-        every.append(Odds([*cases, *found], np.array(logs)))
+        every.append(Odds([*cases, *found], np.array(logs), *of_picture))
     return every
 
 
 def _single(
     y: Floats, H: Floats, P: Floats, variances: Floats, log_clutter: Floats
-) -> list[tuple[list[_Option], list[_Option]]]:
-    """Give, for each picture's lights, the likeliest candidates in their order.
+) -> tuple[list[tuple[list[_Option], list[_Option]]], Floats]:
+    """Give, for each picture's lights, the likeliest candidates in their order; and Odds.spread_px2 of each picture.
 
     Of each the log of the density over clutter, the candidate, and its mode: 1 where it is off by a gross error.
     """
@@ -150,7 +187,7 @@ def _single(
     for found in chain.from_iterable(options):
         found.sort(reverse=True)
         del found[MAX_OPTIONS:]
-    return options
+    return options, np.trace(S[:, 0], axis1=-2, axis2=-1)
 
 
 def _both(

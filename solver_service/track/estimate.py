@@ -37,7 +37,8 @@ class Estimate:
     of those of the last trigger. pictures: how many it has taken since it is confirmed; bare: of these, how many while
     a node had no inertial unit. bars: how many pictures showed both lights, bar_s: when one last did; told_by: how many
     of each node showed any. missed: in how many of each node's last pictures, on end, a light should be and none was
-    used. unseen_by: a node that has shown no light yet.
+    used. looks_away: whether each node's last picture has shown none, wherever they should be. unseen_by: a node that
+    has shown no light yet.
 
     How well it fits: evidence: log odds over clutter; evidence_by: of each node's pictures. baseline: the main
     estimate's at the start. surprise, told: chi^2 of the lights used, and of how many residuals. agreed_s: when a fix
@@ -77,6 +78,7 @@ class Estimate:
     end_s: float = np.inf
     skip_s: float = 0.02
     patience_s: float = CHALLENGE_S
+    looks_away: list[bool] = field(default_factory=lambda: [False, False])
     unseen_by: int | None = None
     searched: bool = False
     lone: bool = False
@@ -111,7 +113,7 @@ class Estimate:
 
     def copied(self, **changes: object) -> Estimate:
         """Give an estimate that goes its own way from here."""
-        of_nodes = "evidence_by", "attitude_s", "told_by", "missed", "without", "turning_off"
+        of_nodes = "evidence_by", "attitude_s", "told_by", "missed", "looks_away", "without", "turning_off"
         lists = *of_nodes, "trigger", "course", "saw"
         own: dict[str, object] = {name: list(getattr(self, name)) for name in lists}
         own |= {"detection": self.detection.copy(), "steps": self.steps.copy(), "used": dict(self.used)}

@@ -171,6 +171,10 @@ class TrackIntake:
         before_s, _ = self._pictured_s.get(node, (t_s, 0.0))
         self._pictured_s[node] = t_s, t_s - before_s
 
+    def between_pictures_s(self, node: int) -> float:
+        """Give how long passed between a node's last two pictures, 0 before there are two."""
+        return self._pictured_s.get(node, (0.0, 0.0))[1]
+
     def gone(self, node: int, t_s: float) -> bool:
         """Whether a node tells no pictures, samples or attitudes at t_s. Nothing later than t_s is looked at."""
         pictured_s, apart_s = self._pictured_s.get(node, (-np.inf, 0.0))

@@ -96,6 +96,27 @@ def in_picture(camera: Camera, pixel_px: Floats | None, margin_px: float = 0.0) 
     )
 
 
+def share_within(camera: Camera, X: Floats, D: Floats, P: Floats, margin_px: float) -> Floats:
+    """Give how likely each light (L,) lies within the picture, margin_px from its edges.
+
+    X (L, 3), D (L, 3, C): the lights and how errors of covariance P (C, C) move them, as `light_positions` gives them.
+    The errors of u and v are taken to be independent.
+    """
+    share = np.zeros(len(X))
+    size_px = np.array((camera.width_px, camera.height_px))
+    for light, pixel in enumerate(pixel_of(camera, each) for each in X):
+        if pixel is None:
+            continue
+        _, tangents = camera.rays(pixel[None])
+        J = tangents[0] @ D[light] / float(np.linalg.norm(X[light]))
+        reach_px = np.sqrt(2.0 * np.maximum((J @ P * J).sum(axis=1), SMALL_PX))
+        near, far = (margin_px - 0.5 - pixel) / reach_px, (size_px - 0.5 - margin_px - pixel) / reach_px
+        inside = math.prod(0.5 * (math.erf(b) - math.erf(a)) for a, b in zip(near.tolist(), far.tolist(), strict=True))
+        # The model of a distorted lens ends outside of the picture.
+        share[light] = inside if inside > 0.0 else 0.0
+    return share
+
+
 def pixel_of(camera: Camera, X: Floats) -> Floats | None:
     """Return where a point (3,) of the camera frame is imaged (2,): Newton's method on the inverse model.
 

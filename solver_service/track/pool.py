@@ -249,7 +249,7 @@ class TrackPool(TrackSteps):
             return
         self._step(estimate, t_s, None)
         state, rates_radps, P = estimate.state, estimate.rates_radps, estimate.covariance[BLOCK]
-        _, y, H = self._compared(sight, state, rates_radps, sight.t_s - estimate.t_s)
+        *_, y, H = self._compared(sight, state, rates_radps, sight.t_s - estimate.t_s)
         log_clutter = math.log(sight.clutter / self.nodes[sight.node].rig.camera.area_px2)
         for k in range(len(y)):
             for light in (0, 1):
@@ -274,7 +274,7 @@ class TrackPool(TrackSteps):
 
     def _force(self, estimate: Estimate, sight: Sight, chosen: Chosen) -> None:
         """Update a start by the lights of the picture that it is made of."""
-        _, y, H = self._compared(sight, estimate.state, estimate.rates_radps, sight.t_s - estimate.t_s)
+        *_, y, H = self._compared(sight, estimate.state, estimate.rates_radps, sight.t_s - estimate.t_s)
         if np.isfinite([y[k, light] for k, light, _ in chosen]).all():
             self._update_lights(estimate, Association(chosen, np.ones(2), 0.0), y, H, sight)
             estimate.used[sight.node, sight.stamp_ns] = chosen

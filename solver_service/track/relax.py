@@ -18,7 +18,7 @@ import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.ahead import told_steps
-from buddyline.solver_service.track.association import Association
+from buddyline.solver_service.track.association import LIKELY, Association
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.guessing import GuessedMotion
 from buddyline.solver_service.track.lamps import LampWatch
@@ -286,8 +286,7 @@ class PathPass(TrackSteps):
         """Decide which of a picture's candidates are lights, by the path."""
         main, observer, camera = self.passed, sight.node, self.nodes[sight.node].rig.camera
         inside = [in_picture(camera, pixel_of(camera, X), EDGE_PX) for X in by_path.X]
-        detection = main.detection[observer] * np.where(inside, 1.0, 0.02)
-        found = by_path.odds.associate(sight.sigma_px, detection)
+        found = by_path.odds.associate(sight.sigma_px, main.detection[observer], np.array(inside, dtype=float), LIKELY)
         main.evidence += found.evidence
         learn_detection(main.detection[observer], inside, found.seen)
         if all(inside):

@@ -10,17 +10,16 @@ from typing import Final
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track import anchors
-from buddyline.solver_service.track.association import Association, Odds, associate, odds_of
+from buddyline.solver_service.track.association import LIKELY, SURE, Association, Odds, associate, odds_of
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.inputs import TrackNode
 from buddyline.solver_service.track.lights import (
     BLOCK,
     COLUMNS,
     Sight,
-    in_picture,
     light_positions,
-    pixel_of,
     residuals,
+    share_within,
 )
 from buddyline.solver_service.track.moving import KNOWN_CLOCK_S, TrackMoves
 from buddyline.solver_service.track.smoother import Path
@@ -34,12 +33,15 @@ from buddyline.solver_service.track.state import (
     State,
     place_covariance,
 )
+from buddyline.solver_service.track.sudden import SuddenTurn, with_sudden
 from buddyline.solver_service.track.trail import Chosen, Look
 
 # Both nodes' pictures of one trigger are less than this apart.
 ONE_TRIGGER_S: Final = 0.03
-# A light nearer to the picture's edge need not be found: part of its spot is outside.
+# A light nearer to the picture's edge need not be found: part of its spot is outside. One should be found where it is
+# this likely further inside.
 EDGE_PX: Final = 2.0
+INSIDE: Final = 0.9
 # Without units, the place must also be known better than to this share of the range, 1 sd: the error of linearization
 # looks like a walk, too.
 WIDE_SHARE: Final = 0.02
@@ -87,10 +89,11 @@ class TrackSights(TrackMoves):
             for look in looks:
                 self.guides[look.node, look.stamp_ns] = PassGuide(path, step, look)
 
-    def _take_lights(self, estimate: Estimate, sight: Sight) -> Look:
-        observer = sight.node
+    def _take_lights(self, estimate: Estimate, sight: Sight) -> tuple[Look, SuddenTurn | None]:
+        """Update an estimate by a picture; give the lights used, and a sudden turn that they show."""
+        observer, turn = sight.node, None
         camera = self.nodes[observer].rig.camera
-        X, y, H = self._compared(sight, estimate.state, estimate.rates_radps, sight.t_s - estimate.t_s)
+        X, D, y, H = self._compared(sight, estimate.state, estimate.rates_radps, sight.t_s - estimate.t_s)
         exact = sight
         # Association and evidence of a start use the plain sigmas, so that all starts compete alike.
         if estimate.confirmed:
@@ -99,21 +102,24 @@ class TrackSights(TrackMoves):
         place = place_covariance(estimate.state, estimate.covariance)
         share = math.sqrt(place.trace()) / float(np.linalg.norm(estimate.state.r_m))
         wide, estimate.wide = share > 0.1, share > WIDE_SHARE
-        if wide:
-            inside = [True, True]
-        else:
-            inside = [in_picture(camera, pixel_of(camera, X[0, light]), EDGE_PX) for light in (0, 1)]
-            detection = detection * np.where(inside, 1.0, 0.02)
-        clutter = sight.clutter / camera.area_px2
+        within = share_within(camera, X[0], D[0], estimate.covariance[BLOCK], EDGE_PX)
+        inside = (within > INSIDE).tolist()
         guide = self.guides.get((observer, sight.stamp_ns))
+        # A start that followed doubtful lights would seem better founded than it is.
+        least = LIKELY if estimate.confirmed else SURE
         given = estimate.given.get((observer, sight.stamp_ns))
         if given is not None:
             found = Association(given, np.zeros(2), 0.0)
-        elif guide is None:
-            found = associate(y, H, estimate.covariance[BLOCK], sight.sigma_px, detection, clutter)
-        else:
+        elif guide is not None:
             [by_path] = self._by_path(guide.path, [(guide, exact)])
-            found = by_path.odds.associate(sight.sigma_px, detection)
+            found = by_path.odds.associate(sight.sigma_px, detection, within, least)
+        else:
+            clutter = sight.clutter / camera.area_px2
+
+            def likely(P: Floats) -> Association:
+                return associate(y, H, P[BLOCK], sight.sigma_px, detection, clutter, within, least)
+
+            found, estimate.covariance, turn = with_sudden(estimate, self._turning_s(estimate), likely)
         if wide and found.chosen and estimate.confirmed:
             y, H = self._about(estimate, sight, found.chosen, guide)
         # What another estimate chose may be behind the camera by this one.
@@ -126,6 +132,7 @@ class TrackSights(TrackMoves):
             estimate.missed[observer] = 0 if found.chosen else estimate.missed[observer] + 1
         estimate.last_seen = found.seen if all(inside) and not wide else None
         learn_detection(estimate.detection[observer], inside, found.seen)
+        estimate.looks_away[observer] = not found.chosen
         if found.chosen:
             if not estimate.confirmed:
                 estimate.used[observer, sight.stamp_ns] = found.chosen
@@ -137,16 +144,22 @@ class TrackSights(TrackMoves):
                 estimate.bars += 1
                 estimate.bar_s = sight.t_s
             estimate.told_by[observer] += 1
-        return Look(observer, sight.stamp_ns, sight.t_s, found.chosen)
+        return Look(observer, sight.stamp_ns, sight.t_s, found.chosen), turn
+
+    def _turning_s(self, estimate: Estimate) -> dict[int, float]:
+        """Give, of each node that may have begun to turn suddenly, how long passed between its last two pictures."""
+        if self.guessed is not None or not estimate.confirmed:
+            return {}
+        return {node: self.between_pictures_s(node) for node in (0, 1) if estimate.without[node]}
 
     def _compared(
         self, sight: Sight, state: State, rates_radps: Floats, after_s: float
-    ) -> tuple[Floats, Floats, Floats]:
-        """Give the lights (camera frame), residuals and Jacobians of a picture after_s after a state."""
+    ) -> tuple[Floats, Floats, Floats, Floats]:
+        """Give the lights (camera frame) and how errors move them, residuals and Jacobians; after_s after a state."""
         lights_m = self.nodes[1 - sight.node].rig.lights_m
         X, D = light_positions(state, sight.node, lights_m, rates_radps, sight.dt_s + after_s)
         y, H = residuals(sight.bearings, sight.tangents, X, D)
-        return X, y, H
+        return X, D, y, H
 
     def _by_path(self, path: Path, seen: Sequence[tuple[PassGuide, Sight]]) -> list[BySight]:
         """Give what a path says of one node's pictures, and each picture's odds by the path without what it has told.
@@ -176,7 +189,8 @@ class TrackSights(TrackMoves):
         rest = R[:, :, None] * np.eye(4) - H_used @ across
         # Rounding, and pictures that share a step, can leave less than nothing.
         values, vectors = np.linalg.eigh(rest)
-        inverse = (vectors / np.maximum(values, 0.02 * R[:, :1])[:, None]) @ np.swapaxes(vectors, 1, 2)
+        values = np.maximum(values, 0.02 * R.min(axis=1, keepdims=True))
+        inverse = (vectors / values[:, None]) @ np.swapaxes(vectors, 1, 2)
         gain = across @ inverse
         P = P + gain @ np.swapaxes(across, 1, 2)
         y_without = y + (H @ (gain @ y_used[..., None])[:, None, None])[..., 0]
@@ -198,7 +212,7 @@ class TrackSights(TrackMoves):
         error[NAV:] = 0.0
         for left in reversed(range(ABOUT_STEPS)):
             state, after_s = estimate.state.plus(error), sight.t_s - estimate.t_s
-            _, y, H = self._compared(sight, state, estimate.rates_radps, after_s)
+            *_, y, H = self._compared(sight, state, estimate.rates_radps, after_s)
             y = y + H @ error[COLUMNS]
             if left and (near := in_front(chosen, y)):
                 rows_H, rows_y, variances = light_rows(near, y, H)

@@ -69,8 +69,10 @@ class TrackSteps(TrackSights):
             self._take_depth(estimate, t_s)
             self._take_attitude(estimate, t_s)
             self._take_turning(estimate, t_s)
+        turn = None
         if sight is not None:
-            looks = (self._take_lights(estimate, sight),)
+            look, turn = self._take_lights(estimate, sight)
+            looks = (look,)
         if not self._keep_s:
             return
         estimate.steps.drop_before(t_s - self._keep_s)
@@ -102,6 +104,8 @@ class TrackSteps(TrackSights):
             )
             if math.isinf(self._keep_s):
                 estimate.steps.pack()
+        if turn is not None:
+            estimate.steps.last = turn.added_to_step(estimate.steps.last)
 
     def increments(self, estimate: Estimate, t_s: float) -> Increments:
         """Integrate both nodes from the estimate's time to t_s; in a pass, together with later steps."""

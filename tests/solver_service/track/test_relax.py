@@ -105,7 +105,7 @@ def test_pictures_are_weighed_together_by_all_the_dive_but_themselves() -> None:
         for (guide, sight), by_path in zip(seen, again._by_path(path, seen), strict=True):
             odds = by_path.odds
             k, after_s = guide.step, guide.look.t_s - float(path.t_s[guide.step])
-            _, y, H = again._compared(sight, path.state(k), path.rates_radps[k], after_s)
+            *_, y, H = again._compared(sight, path.state(k), path.rates_radps[k], after_s)
             information, told = np.linalg.inv(path.covariance(k)), np.zeros(len(COLUMNS))
             for at, light, variance in guide.look.chosen:
                 information = information - H[at, light].T @ H[at, light] / variance

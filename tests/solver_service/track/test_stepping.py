@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 from dataclasses import replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,9 +83,9 @@ def test_a_start_is_weighed_without_the_doubt_of_its_clock_and_moved_with_it(mon
         assert track.main is not None
         return track.main.confirmed
 
-    def noted_weighing(y: Floats, H: Floats, P: Floats, sigma_px: Floats, detection: Floats, clutter: float) -> object:
+    def noted_weighing(y: Floats, H: Floats, P: Floats, sigma_px: Floats, *how_likely: Any) -> object:
         weighed.append((confirmed(), float(sigma_px.max(initial=Setting().sigma_px))))
-        found.append(associate(y, H, P, sigma_px, detection, clutter))
+        found.append(associate(y, H, P, sigma_px, *how_likely))
         return found[-1]
 
     def noted_moving(chosen: Chosen, y: Floats, H: Floats) -> object:

@@ -1,0 +1,199 @@
+"""What a picture tells while it is not certain which candidate is a light, or whether its node has begun to turn."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from buddyline.solver_service.geometry.camera import Camera
+from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log
+from buddyline.solver_service.track.association import LIKELY, SURE, Association, associate
+from buddyline.solver_service.track.estimate import Estimate
+from buddyline.solver_service.track.filter import TrackFilter
+from buddyline.solver_service.track.lights import (
+    Sight,
+    in_picture,
+    light_positions,
+    pixel_of,
+    share_within,
+    sight_of,
+)
+from buddyline.solver_service.track.state import GYRO_BIAS, MOVING, PHI, SIZE, invariant_of_plain
+from buddyline.solver_service.track.sudden import SuddenTurn
+
+from tests.solver_service.track.dives import Setting, bare_of, filter_of, make, project
+
+WIDTH_PX, HEIGHT_PX = 800.0, 600.0
+AREA_PX2 = WIDTH_PX * HEIGHT_PX
+SIGMA_PX = 0.7
+# Only the left lamp is lit, and found in three of four pictures.
+LEFT_LIT = np.array((0.75, 0.0))
+# Both lights are moved alike, by an error in two directions.
+ALIKE = np.eye(2)
+
+
+def seen(candidates_px: Floats, P: Floats, predicted_px: Floats) -> Association:
+    """Decide which candidates (K, 2) are a light that is predicted there, with covariance P (2, 2)."""
+    y = np.stack((candidates_px - predicted_px, candidates_px - predicted_px), axis=1)
+    H = np.broadcast_to(ALIKE, (len(y), 2, 2, 2))
+    clutter = max(len(y) - 1.0, 1.0) / AREA_PX2
+    return associate(y, H, P, np.full(len(y), SIGMA_PX), LEFT_LIT, clutter, least=LIKELY)
+
+
+def test_likely_lights_tell_no_more_than_is_true() -> None:
+    """A light's place is known to 40 px; candidates by chance are among those near it, and it may not be found."""
+    rng = np.random.default_rng(3)
+    P = 40.0**2 * np.eye(2)
+    chi2, doubtful = [], 0
+    for _ in range(3000):
+        true = rng.normal(0.0, 40.0, 2)
+        corner = np.array((WIDTH_PX, HEIGHT_PX)) * -0.5
+        candidates = rng.uniform(corner, -corner, (rng.poisson(4.0), 2))
+        if rng.uniform() < LEFT_LIT[0]:
+            candidates = np.concatenate((candidates, true + rng.normal(0.0, SIGMA_PX, (1, 2))))
+        if not len(candidates):
+            continue
+        for k, light, variance in seen(candidates, P, np.zeros(2)).chosen:
+            assert light == 0
+            gain = P @ np.linalg.inv(P + variance * np.eye(2))
+            off = true - gain @ candidates[k]
+            # A sure light has at most a gross error's doubt, 7 px.
+            if variance > 7.0**2:
+                doubtful += 1
+                chi2.append(off @ np.linalg.solve(P - gain @ P, off))
+    assert doubtful > 300
+    assert 0.5 < np.mean(chi2) / 2.0 < 1.3
+    # Of a Gaussian one in a thousand is above 13.8.
+    assert np.mean(np.array(chi2) > 13.8) < 0.01
+
+
+def test_a_likely_light_at_most_halves_the_variance_and_is_sure_when_it_comes_again() -> None:
+    P, place = 60.0**2 * np.eye(2), np.array((30.0, -40.0))
+    predicted, told = np.zeros(2), []
+    candidates = np.stack((place, np.array((300.0, 200.0)), np.array((-350.0, 100.0)), np.array((-200.0, -250.0))))
+    for _ in range(6):
+        ((k, light, variance),) = seen(candidates, P, predicted).chosen
+        assert (k, light) == (0, 0)
+        gain = P @ np.linalg.inv(P + variance * np.eye(2))
+        told.append(float(np.trace(gain)) / 2.0)
+        predicted, P = predicted + gain @ (place - predicted), P - gain @ P
+    assert 0.2 < told[0] <= 0.5
+    assert any(gain > 0.99 for gain in told)
+    assert math.sqrt(P[0, 0]) < 1.0
+
+
+def test_a_light_that_may_well_be_another_is_left_out() -> None:
+    near = np.array(((10.0, 0.0), (-10.0, 5.0)))
+    assert not seen(near, 40.0**2 * np.eye(2), np.zeros(2)).chosen
+    assert 0.5 < LIKELY < SURE
+
+
+def test_a_light_that_may_be_outside_of_the_picture_is_found_less_surely_and_missed_less() -> None:
+    y, H = np.zeros((1, 2, 2)), np.broadcast_to(ALIKE, (1, 2, 2, 2))
+    P, sigma, found = 20.0**2 * np.eye(2), np.full(1, SIGMA_PX), np.array((0.9, 0.0))
+    sure, half = (associate(y, H, P, sigma, found, 1.0 / AREA_PX2, np.array((within, 1.0))) for within in (1.0, 0.5))
+    # Where it is found, it was in the picture; where it is not, it may have been outside.
+    odds = [np.exp(one.evidence) * np.array((one.seen[0], 1.0 - one.seen[0])) for one in (sure, half)]
+    assert odds[0][0] == pytest.approx(odds[1][0])
+    assert odds[0][1] == pytest.approx(0.1)
+    assert odds[1][1] == pytest.approx(0.55)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        Camera("pinhole", 820, 616, 900.0, 900.0, 409.5, 307.5),
+        Camera("pinhole", 820, 616, 700.0, 710.0, 400.0, 300.0, (-0.2, 0.05, 0.0, 0.0, 0.0)),
+        Camera("fisheye", 820, 616, 400.0, 400.0, 409.5, 307.5, (0.02, -0.01, 0.0, 0.0)),
+    ],
+)
+@pytest.mark.parametrize("pixel", [(400.0, 300.0), (10.0, 200.0), (-15.0, 580.0), (830.0, 630.0)])
+def test_the_share_of_a_light_within_the_picture(camera: Camera, pixel: tuple[float, float]) -> None:
+    rng = np.random.default_rng(5)
+    X = 6.0 * camera.bearings(np.array((pixel,)))
+    root = rng.normal(0.0, 0.08, (3, 3))
+    D = np.eye(3)[None]
+    share = share_within(camera, X, D, root @ root.T, 2.0)
+    drawn = [pixel_of(camera, X[0] + root @ rng.normal(0.0, 1.0, 3)) for _ in range(4000)]
+    inside = np.mean([in_picture(camera, one, 2.0) for one in drawn])
+    assert share[0] == pytest.approx(inside, abs=0.06)
+
+
+def test_a_light_behind_the_camera_is_not_within_the_picture() -> None:
+    camera = Camera("pinhole", 820, 616, 900.0, 900.0, 409.5, 307.5)
+    X = np.array(((0.0, 0.0, -3.0), (0.0, 0.0, 3.0)))
+    share = share_within(camera, X, np.broadcast_to(np.eye(3), (2, 3, 3)), 1e-4 * np.eye(3), 2.0)
+    assert share.tolist() == [0.0, 1.0]
+
+
+@pytest.fixture(scope="module")
+def without_units() -> tuple[TrackFilter, Estimate, Sight]:
+    """Give a filter of a dive without units, its confirmed estimate, and A's next picture as that predicts it."""
+    dive = make(1, Setting(seconds=6.0, false=0))
+    track = filter_of(bare_of(dive), dive.fixes)
+    track.advance(dive.stamps_ns[-1])
+    known = track.main
+    assert known is not None
+    assert known.confirmed
+    later = known.copied()
+    track._step(later, known.t_s + 0.1, None)
+    return track, known, picture(track, later, np.zeros(3))
+
+
+def picture(track: TrackFilter, estimate: Estimate, turned_rad: Floats) -> Sight:
+    """Give A's picture by an estimate, and by its turn about camera axes."""
+    rig, lights_m = track.nodes[0].rig, track.nodes[1].rig.lights_m
+    X, _ = light_positions(estimate.state, 0, lights_m, estimate.rates_radps, np.zeros(1))
+    pixels = project(X[0] @ rotation_exp(turned_rad))
+    assert all(in_picture(rig.camera, pixel, 2.0) for pixel in pixels)
+    return sight_of(rig, 0, 0, estimate.t_s, pixels, np.full(2, SIGMA_PX), np.zeros(2))
+
+
+@pytest.mark.parametrize("turned_rad", [0.0, 0.04])
+def test_a_turn_that_lights_show_at_once_is_a_turn_and_no_motion(
+    without_units: tuple[TrackFilter, Estimate, Sight], turned_rad: float
+) -> None:
+    """A turns by two degrees more than it has ever done from one picture to the next."""
+    track, known, calm = without_units
+    estimate, later = known.copied(), known.copied()
+    track._step(later, calm.t_s, None)
+    quiet = later.steps.last
+    track._step(estimate, calm.t_s, picture(track, later, np.array((0.0, turned_rad, 0.0))))
+    step, sudden = estimate.steps.last, turned_rad > 0.0
+    rate = slice(GYRO_BIAS[0].start - MOVING, GYRO_BIAS[0].stop - MOVING)
+    assert len(step.looks[0].chosen) == 2
+    # The smoother is told of the noise that the filter has taken.
+    assert (step.walk[rate] > 10.0 * quiet.walk[rate]).all() == sudden
+    assert (np.diag(step.Q)[PHI[0]] > 10.0 * np.diag(quiet.Q)[PHI[0]]).all() == sudden
+    turn_rad = rotation_log(later.state.R[0].T @ estimate.state.R[0])
+    assert turn_rad == pytest.approx((0.0, turned_rad, 0.0), abs=0.008)
+    place_m = [one.state.R[0].T @ one.state.r_m for one in (later, estimate)]
+    expected = rotation_exp(np.array((0.0, -turned_rad, 0.0))) @ place_m[0]
+    assert np.linalg.norm(place_m[1] - expected) < 0.01 * np.linalg.norm(expected)
+
+
+def test_a_steps_noise_holds_a_sudden_turn_of_one_node(without_units: tuple[TrackFilter, Estimate, Sight]) -> None:
+    _, known, _ = without_units
+    turn = SuddenTurn.of(known.state, 1, 0.1)
+    P = turn.added_to(known.covariance)
+    more = P - known.covariance
+    T = np.eye(SIZE)
+    T[:MOVING, :MOVING] = invariant_of_plain(known.state)
+    plain = np.linalg.inv(T) @ more @ np.linalg.inv(T).T
+    expected = np.zeros(SIZE)
+    expected[PHI[1]], expected[GYRO_BIAS[1]] = 1.5**2 * 0.1**3 / 3.0, 1.5**2 * 0.1
+    np.testing.assert_allclose(plain, np.diag(expected), atol=1e-12)
+
+
+def test_a_node_that_shows_no_light_is_taken_to_turn_more_freely(
+    without_units: tuple[TrackFilter, Estimate, Sight],
+) -> None:
+    track, known, calm = without_units
+    walks = []
+    for looks_away in (False, True):
+        estimate = known.copied(looks_away=[looks_away, False])
+        track._step(estimate, calm.t_s, None)
+        walks.append(estimate.steps.last.walk[GYRO_BIAS[0].start - MOVING])
+    assert walks[1] == pytest.approx(0.45**2 * 0.1)
+    assert walks[0] < 0.2 * walks[1]
