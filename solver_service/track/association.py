@@ -52,7 +52,8 @@ class Odds:
     """Every assignment of one picture's candidates, and the logs (N,) of their densities over clutter.
 
     How likely each light is found is left out: that is learned from picture to picture. y_px (K, 2, 2): how far each
-    candidate stands off each light; spread_px2 (K, 2): how far it may, by what is predicted, as a mean square.
+    candidate stands off each light; spread_px2 (K, 2): the variance of that by what is predicted, in the direction in
+    which it is largest.
     """
 
     cases: list[Case]
@@ -105,15 +106,14 @@ class Odds:
     def _doubt_px2(self, k: int, light: int, marginal: Mapping[tuple[int, int], Sequence[float]]) -> float:
         """Give what the variance of a light, candidate k, gains because it may be another candidate or none.
 
-        That is the mixture's mean square about k; a light that is none of them is where it was predicted. One variance
-        stands poorly for places far apart, so it is the prediction's at least: such a light tells no more than what is
-        known already.
+        That is how far off k would be, as a mean square; a light that is no candidate is where it was predicted. One
+        variance stands poorly for places far apart, so the prediction's is added: no variance is more than halved.
         """
         y = self.y_px[k, light]
         odds = {other: sum(found) for (other, of), found in marginal.items() if of == light}
         apart_px2 = sum(share * float(((self.y_px[other, light] - y) ** 2).sum()) for other, share in odds.items())
         missing = max(1.0 - sum(odds.values()), 0.0)
-        return apart_px2 + missing * float(y @ y) + 0.5 * float(self.spread_px2[k, light])
+        return apart_px2 + missing * float(y @ y) + float(self.spread_px2[k, light])
 
 
 def associate(
@@ -187,7 +187,8 @@ def _single(
     for found in chain.from_iterable(options):
         found.sort(reverse=True)
         del found[MAX_OPTIONS:]
-    return options, np.trace(S[:, 0], axis1=-2, axis2=-1)
+    half, across = 0.5 * np.trace(S[:, 0], axis1=-2, axis2=-1), S[:, 0, ..., 0, 1]
+    return options, half + np.hypot(half - S[:, 0, ..., 1, 1], across)
 
 
 def _both(

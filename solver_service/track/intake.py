@@ -169,7 +169,7 @@ class TrackIntake:
     def _hear(self, node: int, t_s: float) -> None:
         """Note a node's picture, which has its turn."""
         before_s, _ = self._pictured_s.get(node, (t_s, 0.0))
-        self._pictured_s[node] = t_s, t_s - before_s
+        self._pictured_s[node] = t_s, max(t_s - before_s, 0.0)
 
     def between_pictures_s(self, node: int) -> float:
         """Give how long passed between a node's last two pictures, 0 before there are two."""

@@ -157,9 +157,10 @@ class TrackMoves(TrackIntake):
 
     def _noises(self, estimate: Estimate, t_s: float) -> tuple[Noise, Noise]:
         gyro, accel, push, rate, wander = estimate.walking.densities.tolist()
-        rates = (rate, rate)
         if self.guessed is not None:
             push, *rates = self.guessed.at(t_s).tolist()
+        else:
+            rates = [max(rate, AWAY_RATE) if away else rate for away in estimate.looks_away]
         noises = []
         for node in (0, 1):
             noise = self.samples[node].noise(t_s).scaled(self.unrest)
@@ -225,16 +226,17 @@ class TrackMoves(TrackIntake):
     ) -> tuple[Floats | None, Floats]:
         """Give what a step adds to the derivatives by the walks of nodes without units: of covariance and state.
 
-        Of a sudden turn, nothing is learned. Of a tilt error q that decays, q1 = k q0 + n, var n = s^2 (1 - k^2), the
-        logarithm of k is minus a number times the walk's variance: dk = k ln k, dvar n = -2 k^2 ln k s^2 dlog.
+        Of a sudden turn, or while a node looks away, nothing is learned of its turning. Of a tilt error q that decays,
+        q1 = k q0 + n, var n = s^2 (1 - k^2), the logarithm of k is minus a number times the walk's variance:
+        dk = k ln k, dvar n = -2 k^2 ln k s^2 dlog.
         """
         drift = np.zeros(SIZE)
         if not parts.without.any():
             return None, drift
         guessed = guessed_noise(parts, noises, span_s, shares)
-        if taken != noises:
-            guessed[1] = 0.0
         for node in (0, 1):
+            if estimate.looks_away[node] or taken[node].gap_rate_radps != noises[node].gap_rate_radps:
+                guessed[1, PHI[node], PHI[node]] = guessed[1, GYRO_BIAS[node], GYRO_BIAS[node]] = 0.0
             if parts.without[node]:
                 k = float(shares[node])
                 log_k = math.log(k) if k > 0.0 else 0.0
@@ -254,11 +256,7 @@ class TrackMoves(TrackIntake):
 
         A diver who looks away turns within tenths of a second as he has not for minutes: attitude messages say so.
         """
-        if self.guessed is not None or not estimate.without[node]:
-            return noise
-        if estimate.looks_away[node]:
-            noise = replace(noise, gap_rate_radps=max(noise.gap_rate_radps, AWAY_RATE))
-        near = self.turning[node].at(to_s, to_s + HOLD_S)
+        near = self.turning[node].at(to_s, to_s + HOLD_S) if estimate.without[node] and self.guessed is None else None
         if near is None:
             return noise
         R_level_camera, variances = near

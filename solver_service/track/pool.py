@@ -268,6 +268,7 @@ class TrackPool(TrackSteps):
                 chosen = ((k, light, START_PX**2),)
                 self._update_lights(child, Association(chosen, np.ones(2), 0.0), y, H, sight)
                 child.used[sight.node, sight.stamp_ns] = chosen
+                child.looks_away[sight.node] = False
                 if child.steps:
                     child.steps.last = replace(child.steps.last, after=child.state.row, covariance=child.covariance)
                 self.challengers.append(child)

@@ -128,8 +128,10 @@ class TrackSights(TrackMoves):
         estimate.trigger = [seen for seen in estimate.trigger if abs(sight.t_s - seen[0]) < ONE_TRIGGER_S]
         estimate.evidence += found.evidence
         estimate.evidence_by[observer] += found.evidence
-        if any(inside) and not wide:
-            estimate.missed[observer] = 0 if found.chosen else estimate.missed[observer] + 1
+        if found.chosen:
+            estimate.missed[observer] = 0
+        elif any(inside) and not wide:
+            estimate.missed[observer] += 1
         estimate.last_seen = found.seen if all(inside) and not wide else None
         learn_detection(estimate.detection[observer], inside, found.seen)
         estimate.looks_away[observer] = not found.chosen
@@ -189,7 +191,8 @@ class TrackSights(TrackMoves):
         rest = R[:, :, None] * np.eye(4) - H_used @ across
         # Rounding, and pictures that share a step, can leave less than nothing.
         values, vectors = np.linalg.eigh(rest)
-        values = np.maximum(values, 0.02 * R.min(axis=1, keepdims=True))
+        least = 0.02 * np.where(H_used.any(axis=2), R, np.inf).min(axis=1, keepdims=True)
+        values = np.maximum(values, least)
         inverse = (vectors / values[:, None]) @ np.swapaxes(vectors, 1, 2)
         gain = across @ inverse
         P = P + gain @ np.swapaxes(across, 1, 2)

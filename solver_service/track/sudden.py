@@ -57,14 +57,13 @@ def with_sudden(
     """Give a picture's lights, and the covariance that they go with: the estimate's, or that with a sudden turn.
 
     spans_s: of each node that may have turned, for how long; likely: what the lights are by a covariance. The third is
-    the turn, None for none.
+    the turn, None for none; the evidence of one is less by LEAD, for it is rare.
     """
     best: tuple[Association, Floats, SuddenTurn | None] = likely(estimate.covariance), estimate.covariance, None
-    least = best[0].evidence + LEAD
     for node, span_s in spans_s.items():
         turn = SuddenTurn.of(estimate.state, node, min(span_s, LONGEST_S))
         P = turn.added_to(estimate.covariance)
         found = likely(P)
-        if found.evidence > least:
-            best, least = (found, P, turn), found.evidence
+        if found.evidence - LEAD > best[0].evidence:
+            best = replace(found, evidence=found.evidence - LEAD), P, turn
     return best

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from buddyline.solver_service.track.lights import (
     sight_of,
 )
 from buddyline.solver_service.track.state import GYRO_BIAS, MOVING, PHI, SIZE, invariant_of_plain
-from buddyline.solver_service.track.sudden import SuddenTurn
+from buddyline.solver_service.track.sudden import SuddenTurn, with_sudden
 
 from tests.solver_service.track.dives import Setting, bare_of, filter_of, make, project
 
@@ -81,6 +82,21 @@ def test_a_likely_light_at_most_halves_the_variance_and_is_sure_when_it_comes_ag
     assert 0.2 < told[0] <= 0.5
     assert any(gain > 0.99 for gain in told)
     assert math.sqrt(P[0, 0]) < 1.0
+
+
+def test_a_likely_light_at_most_halves_the_variance_in_each_direction() -> None:
+    c = math.sqrt(0.5)
+    for P in (
+        np.diag((200.0**2, 20.0**2)),
+        np.array(((c, c), (-c, c))) @ np.diag((160.0**2, 25.0**2)) @ np.array(((c, -c), (c, c))),
+    ):
+        place = 0.2 * P[0] / math.sqrt(P[0, 0])
+        others = np.array(((300.0, 200.0), (-350.0, 100.0), (-200.0, -250.0)))
+        ((k, _, variance),) = seen(np.concatenate((place[None], others)), P, np.zeros(2)).chosen
+        assert k == 0
+        assert variance > 7.0**2
+        left = P - P @ np.linalg.inv(P + variance * np.eye(2)) @ P
+        assert (np.linalg.eigvals(np.linalg.inv(P) @ left) > 0.499).all()
 
 
 def test_a_light_that_may_well_be_another_is_left_out() -> None:
@@ -197,3 +213,49 @@ def test_a_node_that_shows_no_light_is_taken_to_turn_more_freely(
         walks.append(estimate.steps.last.walk[GYRO_BIAS[0].start - MOVING])
     assert walks[1] == pytest.approx(0.45**2 * 0.1)
     assert walks[0] < 0.2 * walks[1]
+
+
+def test_a_sudden_turn_is_no_better_evidence_than_it_is_rare(
+    without_units: tuple[TrackFilter, Estimate, Sight],
+) -> None:
+    _, known, _ = without_units
+    usual = np.trace(known.covariance)
+    for by_turn, gained in ((12.9, 0.0), (13.5, 0.5), (19.0, 6.0)):
+        sure = {True: Association((), np.zeros(2), 10.0), False: Association((), np.zeros(2), by_turn)}
+        found, P, turn = with_sudden(known, {0: 0.1, 1: 0.1}, lambda P, sure=sure: sure[np.trace(P) == usual])
+        assert found.evidence == pytest.approx(10.0 + gained)
+        assert (turn is not None) == (gained > 0.0) == (np.trace(P) > usual)
+
+
+def test_only_nodes_without_a_unit_turn_suddenly_and_only_once_confirmed(
+    without_units: tuple[TrackFilter, Estimate, Sight],
+) -> None:
+    track, known, _ = without_units
+    assert track._turning_s(known) == pytest.approx({0: 0.1, 1: 0.1}, abs=0.02)
+    assert list(track._turning_s(known.copied(without=[False, True]))) == [1]
+    assert track._turning_s(known.copied(confirmed=False)) == {}
+
+
+def test_a_picture_without_a_light_is_one_of_a_node_that_looks_away_until_it_shows_one(
+    without_units: tuple[TrackFilter, Estimate, Sight],
+) -> None:
+    track, known, calm = without_units
+    estimate = known.copied()
+    nothing = sight_of(track.nodes[0].rig, 0, 0, calm.t_s, np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+    track._step(estimate, calm.t_s, nothing)
+    assert estimate.looks_away[0]
+    track._step(estimate, calm.t_s + 0.001, calm)
+    assert not estimate.looks_away[0]
+
+
+def test_a_start_uses_no_light_that_is_only_likely(without_units: tuple[TrackFilter, Estimate, Sight]) -> None:
+    track, known, calm = without_units
+    used = []
+    for confirmed in (True, False):
+        estimate = known.copied(confirmed=confirmed, detection=np.full((2, 2), 0.3))
+        # Its lights are some 100 px wide, and clutter is all about.
+        estimate.covariance = known.covariance + np.diag(np.isin(np.arange(SIZE), range(3)) * 0.25)
+        track._step(estimate, calm.t_s, replace(calm, elsewhere=14))
+        used.append([variance for _, _, variance in estimate.steps.last.looks[0].chosen])
+    assert max(used[0]) > 7.0**2
+    assert not used[1] or max(used[1]) < 7.0**2
