@@ -25,7 +25,7 @@ MAX_OPTIONS: Final = 10
 # The residual of a light behind the camera.
 NOWHERE_PX: Final = 1e8
 IN_PICTURE: Final[Floats] = np.ones(2)
-"""That both lights are surely within the picture."""
+"""Both lights are surely within the picture."""
 _LOG_SHARES: Final = np.log((1.0 - GROSS_SHARE, GROSS_SHARE))
 
 Case: TypeAlias = tuple[tuple[int, int] | None, tuple[int, int] | None]

@@ -38,8 +38,8 @@ from buddyline.solver_service.track.trail import Chosen, Look
 
 # Both nodes' pictures of one trigger are less than this apart.
 ONE_TRIGGER_S: Final = 0.03
-# A light nearer to the picture's edge need not be found: part of its spot is outside. One should be found where it is
-# this likely further inside.
+# A light nearer to the picture's edge need not be found: part of its spot is outside. A light should be found whose
+# probability to be further inside is above INSIDE.
 EDGE_PX: Final = 2.0
 INSIDE: Final = 0.9
 # Without units, the place must also be known better than to this share of the range, 1 sd: the error of linearization
