@@ -84,10 +84,12 @@ class SimulatedCamera:
             return None
         self._last_ns = instant_ns
         exposure, context = self._fixed, None
+        trigger = trigger_index(instant_ns, self._period_ns)
         if self.exposure_control is not None:
-            exposure, context = self.exposure_control.take(trigger_index(instant_ns, self._period_ns))
+            exposure, context = self.exposure_control.take(trigger)
         picture = self._world.render(self._node, instant_ns, exposure)
-        return Frame(picture, instant_ns, exposure=exposure, context=context)
+        stamp_ns = instant_ns + self._world.stamp_error_ns(self._node, trigger)
+        return Frame(picture, stamp_ns, exposure=exposure, context=context)
 
     def close(self) -> None:
         """Nothing to free."""

@@ -22,6 +22,7 @@ from buddyline.node.sim.world import World
 from buddyline.protocol import topics
 from buddyline.protocol.clock import MS_NS, S_NS, trigger_index
 from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 BOOT: Final = "simulated"
@@ -60,7 +61,7 @@ def _samples(sample: Callable[[str, int], Message], node: str, key: str, stamps_
 
 def _triggers(world: World, plan: DivePlan, end_ns: int) -> Iterator[int]:
     """Yield the trigger numbers of a dive, from the first whose exposure cannot be before the dive's start."""
-    lead_ns = 5 * plan.exposure_sigma_ns + MS_NS
+    lead_ns = 5 * (plan.exposure_sigma_ns + world.scenario.stamp_sigma_ns) + MS_NS
     yield from range(-(-(world.scenario.start_ns + lead_ns) // plan.period_ns), -(-end_ns // plan.period_ns))
 
 
@@ -87,15 +88,17 @@ def _frames(world: World, plan: DivePlan, node: str, end_ns: int) -> Iterator[En
         lost = float(rng.random()) < plan.lost_share
         if lost:
             continue
-        stamp_ns = instant * plan.period_ns + round(stray * plan.exposure_sigma_ns)
+        taken_ns = instant * plan.period_ns + round(stray * plan.exposure_sigma_ns)
+        stamp_ns = taken_ns + world.stamp_error_ns(node, instant)
         trigger = trigger_index(stamp_ns, plan.period_ns)
         if plan.images:
-            picture = world.render(node, stamp_ns) if eye is None else eye.take(stamp_ns, trigger)
+            picture = world.render(node, taken_ns) if eye is None else eye.take(taken_ns, trigger)
             yield stamp_ns, topics.IMAGE.key(node), _message(picture, node, stamp_ns)
         else:
-            yield stamp_ns, topics.CANDIDATES.key(node), world.candidates(node, stamp_ns, trigger, seq, BOOT)
+            found = world.candidates(node, taken_ns, trigger, seq, BOOT)
+            yield stamp_ns, topics.CANDIDATES.key(node), replace(found, stamp_ns=stamp_ns)
         seq += 1
-        yield stamp_ns, light_truth, world.light_truth(node, stamp_ns, trigger)
+        yield stamp_ns, light_truth, replace(world.light_truth(node, taken_ns, trigger), stamp_ns=stamp_ns)
 
 
 class _Eye:

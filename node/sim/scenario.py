@@ -87,9 +87,10 @@ class Scenario:
     miss_share: share of lights that give no candidate. false_lights: false candidates in each picture.
     other_lamps: other divers' lamps in the water. tags: whether each node carries two AR tags.
     interruptions: whether nodes look away and things pass before lights. clock_offset_ns: B's clock minus A's at
-    the start. clock_drift: what B's clock gains, s a second. Further nodes have B's clock. magnetometer_off_rad:
-    constant error of B's heading that its sigma does not include. inertial: quality of the inertial units.
-    dead_lamps: lights that are dark for the whole dive, such as "b.left".
+    the start. clock_drift: what B's clock gains, s a second. Further nodes have B's clock. stamp_sigma_ns: how far a
+    picture's stamp is off its exposure, 1 sd. magnetometer_off_rad: constant error of B's heading that its sigma does
+    not include. inertial: quality of the inertial units. dead_lamps: lights that are dark for the whole dive, such as
+    "b.left".
     blink_slot_ns: length of the slots in which each node's left lamp blinks by a code of its own; 0: no lamp blinks.
     pwm_hz: frequency at which the lights are dimmed by pulses (0: steady); a picture shows it, with a rolling shutter
     in its rows. pwm_depth: how far their light swings from its mean, as a share of it.
@@ -125,6 +126,7 @@ class Scenario:
     interruptions: bool = True
     clock_offset_ns: int = 0
     clock_drift: float = 0.0
+    stamp_sigma_ns: int = MS_NS
     magnetometer_off_rad: float = 0.0
     inertial: InertialGrade = "good"
     dead_lamps: tuple[str, ...] = ()

@@ -98,6 +98,11 @@ class World:
         placement = self._scene.motion.placement(index, self._seconds(index, stamp_ns))
         return placement.R_ned_body @ R_BODY_CAMERA, placement.position_ned_m
 
+    def stamp_error_ns(self, node: str, trigger: int) -> int:
+        """Return how much later the stamp of a node's picture is than its exposure."""
+        rng = generator(self.scenario.seed, "stamps", self.scenario.index(node), trigger)
+        return round(max(-5.0, min(5.0, float(rng.standard_normal()))) * self.scenario.stamp_sigma_ns)
+
     def truth(self, stamp_ns: int, trigger: int, pair: tuple[str, str] | None = None) -> Truth:
         """Return a pair's true T_a_b at stamp_ns on A's clock; pair: None for the first two nodes."""
         t_s = self._seconds(0, stamp_ns)
