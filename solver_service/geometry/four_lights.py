@@ -187,11 +187,11 @@ def refine_lights(T_a_b: SE3, frames: Floats, lights_m: Floats) -> Refined:
 def _motion_variance(batch: Batch) -> Floats:
     """Give what relative motion between the exposures may add to ln range and twist, rad^2: (P,), for pairs of A's."""
     seen, settings, pairs = batch.candidates, batch.settings, batch.pairs
-    if settings.skew_sigma_s == 0.0 and not seen.dt_s.any():
+    if settings.still and not seen.dt_s.any():
         return np.zeros(len(pairs.chord))
     total_s = np.bincount(seen.image, seen.dt_s, minlength=2 * batch.triggers).reshape(-1, 2)
     mean_s = total_s / np.maximum(seen.counts, 1)
-    square_s2 = (mean_s[:, 0] - mean_s[:, 1]) ** 2 + settings.skew_sigma_s**2
+    square_s2 = (mean_s[:, 0] - mean_s[:, 1]) ** 2 + settings.skew_sigma_s**2 + 2.0 * settings.stamp_sigma_s**2
     speed_per_chord_mps = settings.speed_mps / float(batch.rigs.length_m[1])
     variance: Floats = square_s2[pairs.trigger] * ((speed_per_chord_mps * pairs.chord) ** 2 + settings.turn_radps**2)
     return variance

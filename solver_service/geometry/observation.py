@@ -132,6 +132,10 @@ class Heading:
     variance: float
 
 
+# How far a picture's stamp may be off its exposure, 1 sd. Dives that others simulated show 1.1 ms.
+STAMP_SIGMA_S: Final = 1e-3
+
+
 @dataclass(frozen=True)
 class Settings:
     """How triggers are solved.
@@ -140,7 +144,8 @@ class Settings:
     every other; min_oriented_probability: the same where both attitudes speak, because a right pose is then nearly
     certain; more is asked of one that no earlier pose supports. range_min_m: nearer, no picture of 60 degrees holds a
     bar of 0.57 m. gate_sigma: both gaps, in standard deviations. speed_mps, turn_radps: relative motion where the prior
-    knows none (1 sd); skew_sigma_s: how well the clocks agree (1 sd).
+    knows none (1 sd); skew_sigma_s: how well the clocks agree (1 sd); stamp_sigma_s: how well a picture's stamp tells
+    its exposure (1 sd).
     """
 
     method: Method = "refined"
@@ -153,6 +158,12 @@ class Settings:
     speed_mps: float = 0.2
     turn_radps: float = 0.2
     skew_sigma_s: float = 0.0
+    stamp_sigma_s: float = STAMP_SIGMA_S
+
+    @property
+    def still(self) -> bool:
+        """Whether all exposures of a trigger were at the same instant, as far as is known without their stamps."""
+        return self.skew_sigma_s == 0.0 and self.stamp_sigma_s == 0.0
 
     @cached_property
     def gaps(self) -> int:

@@ -39,20 +39,22 @@ _SINES_AND_TRACE: Final = np.column_stack((0.5 * skew(np.eye(3)).reshape(3, 9).T
 class Motion:
     """How the pose moves: d/dt of t_a_b (m/s), then of the small rotation w (rad/s), in A's axes.
 
-    rates: (6,), covariance: (6, 6). skew_sigma_s: how well the two clocks agree, 1 sd.
+    rates: (6,), covariance: (6, 6). skew_sigma_s, stamp_sigma_s: as of Settings.
     """
 
     rates: Floats
     covariance: Floats
-    skew_sigma_s: float = 0.0
+    skew_sigma_s: float
+    stamp_sigma_s: float
 
     @staticmethod
     def of(prior: Prior | None, settings: Settings) -> Motion:
         """Take what is predicted, or what a pair may do."""
-        if prior is None or prior.rates is None or prior.rates_covariance is None:
+        rates, covariance = (None, None) if prior is None else (prior.rates, prior.rates_covariance)
+        if rates is None or covariance is None:
             speed2, turn2 = settings.speed_mps**2, settings.turn_radps**2
-            return Motion(np.zeros(6), np.diag((speed2, speed2, speed2, turn2, turn2, turn2)), settings.skew_sigma_s)
-        return Motion(prior.rates, prior.rates_covariance, settings.skew_sigma_s)
+            rates, covariance = np.zeros(6), np.diag((speed2, speed2, speed2, turn2, turn2, turn2))
+        return Motion(rates, covariance, settings.skew_sigma_s, settings.stamp_sigma_s)
 
 
 @dataclass(eq=False, slots=True)

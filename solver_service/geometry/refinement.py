@@ -145,14 +145,17 @@ def light_rows(T_a_b: SE3, frames: Floats, lights_m: Floats) -> tuple[Floats, Fl
 def at_one_instant(rows: Floats, dt_s: Floats, skew_sign: Floats, motion: Motion) -> Solved:
     """Solve again for what is known of the motion between the sightings, by the same linearization.
 
-    dt_s: (K, n) of each residual. skew_sign: (n,) which way half of the clocks' disagreement moves it in time.
+    dt_s: (K, n) of each residual. skew_sign: (n,) which way half of the clocks' disagreement moves it in time: 1 in A's
+    picture, -1 in B's, 0 in none. The residuals of a picture share the error of its stamp.
     """
     J = rows[:, :, :6]
     by_rate = J * dt_s[:, :, None]
     total = by_rate @ motion.covariance @ by_rate.swapaxes(1, 2)
-    if motion.skew_sigma_s > 0.0:
-        by_skew = J * (0.5 * motion.skew_sigma_s * skew_sign)[:, None]
-        total += by_skew @ (motion.covariance + np.outer(motion.rates, motion.rates)) @ by_skew.swapaxes(1, 2)
+    in_a, in_b = (motion.stamp_sigma_s * (skew_sign == sign) for sign in (1.0, -1.0))
+    squares = motion.covariance + np.outer(motion.rates, motion.rates)
+    for late_s in (in_a, in_b, 0.5 * motion.skew_sigma_s * skew_sign):
+        by_time = J * late_s[:, None]
+        total += by_time @ squares @ by_time.swapaxes(1, 2)
     total += _UNIT_NOISE[: rows.shape[1], : rows.shape[1]]
     shifted = rows.copy()
     shifted[:, :, 6] += by_rate @ motion.rates

@@ -141,7 +141,7 @@ def _likeliest(log_ratio: Floats, read_at: Indices) -> Indices:
 def _solve(readings: Readings, place: Indices, past: Past) -> Solved:
     """Take the last step, for what is known of the motion."""
     dt_s = readings.dt_s[place]
-    if past.settings.skew_sigma_s == 0.0 and not dt_s.any():
+    if past.settings.still and not dt_s.any():
         return readings.refined.solved[place]
     rows = readings.refined.rows[place]
     return at_one_instant(rows, dt_s, _SKEW_SIGN[: rows.shape[1]], past.motion)

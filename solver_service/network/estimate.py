@@ -23,9 +23,9 @@ from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.association import Odds, odds_of
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.intake import TrackIntake, newest_before
-from buddyline.solver_service.track.lights import Sight, in_picture, pixel_of, residuals
+from buddyline.solver_service.track.lights import Sight, in_picture, pixel_of, residuals, with_stamp
 from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S
-from buddyline.solver_service.track.seeing import EDGE_PX
+from buddyline.solver_service.track.seeing import EDGE_PX, noise_of
 from buddyline.solver_service.track.start import tilt_of
 from buddyline.solver_service.track.stepping import TICK_S
 from numpy.typing import NDArray
@@ -128,7 +128,7 @@ class NetEstimate(NetBelief):
         lights_m = np.array([self.nodes[self.members[other].node].rig.lights_m for other in others])
         X, D = light_positions(self.state, observers, others, lights_m, self.rates_radps, times_s)
         which = columns(observers, others)
-        P = self.covariance[which[:, :, None], which[:, None, :]]
+        P = with_stamp(self.covariance[which[:, :, None], which[:, None, :]])
         first = D[:, 0, 0]
         spread_m2 = np.trace(first @ P @ np.swapaxes(first, 1, 2), axis1=1, axis2=2)
         wide = spread_m2 > 0.01 * (X[:, 0, 0] ** 2).sum(axis=1)
@@ -213,11 +213,11 @@ class NetEstimate(NetBelief):
         """Update by the lights chosen, each by bar, candidate, light and variance; which (B, WIDTH): as `columns`."""
         n, k, light, variances = (np.array(each) for each in zip(*chosen, strict=True))
         rows = np.zeros((len(chosen), 2, len(self.covariance)))
-        rows[np.arange(len(chosen))[:, None, None], [[0], [1]], which[n][:, None]] = H[n, k, light]
+        rows[np.arange(len(chosen))[:, None, None], [[0], [1]], which[n][:, None]] = H[n, k, light, :, :-1]
         for bar in (bars[one] for one, *_ in chosen):
             for member in (self.members[bar.other], self.members[bar.observer]):
                 member.light_s = max(member.light_s, bar.sight.t_s)
-        noise = np.diag(np.repeat(variances, 2))
+        noise = noise_of(variances, H[n, k, light, :, -1], np.array([id(bars[one].sight) for one in n]))
         self._apply(rows.reshape(2 * len(chosen), -1), y[n, k, light].ravel(), noise, teaches=True)
 
     def _judge(self) -> None:

@@ -32,10 +32,12 @@ def light_positions(
 ) -> tuple[Floats, Floats]:
     """Give other nodes' lights (B, L, 3) in observers' camera frames (B), at times_s (B, T) after the state's.
 
-    Returns X (B, T, L, 3) and D (B, T, L, 3, WIDTH): dX by the errors of `columns`. rates_radps (n, 3): turn rates.
+    Returns X (B, T, L, 3) and D (B, T, L, 3, WIDTH + 1): dX by the errors of `columns`, and by the picture's own time.
+    rates_radps (n, 3): turn rates.
     With a = p + R l the light's place in the net's frame, all carried on by v and w, for the other node by the
     difference of both clocks too:
     X = R_i^T (a - p_i),  dX = R_i^T (dp_j - dp_i + t_j dv_j - t_i dv_i - [a]x (phi_j - phi_i)) + R_i^T a' (dc_j - dc_i)
+    dX/dt = R_i^T (a' - v_i) - w_i x X
     """
     i, j = list(observers), list(others)
     ahead = times_s + (state.clock_s[j] - state.clock_s[i])[:, None]  # (B, T)
@@ -48,14 +50,17 @@ def light_positions(
     a = (state.p_m[j][:, None] + ahead[..., None] * v_mps)[:, :, None] + arms
     eye = (state.p_m[i][:, None] + times_s[..., None] * state.v_mps[i][:, None])[:, :, None]
     X = (toward @ (a - eye)[..., None])[..., 0]
-    D = np.zeros((*X.shape, WIDTH))
+    D = np.zeros((*X.shape, WIDTH + 1))
     half = WIDTH // 2
     D[..., half : half + 3] = toward
     D[..., half + 3 : half + 6] = toward * ahead[..., None, None, None]
     D[..., half + 6 : half + 9] = -(toward @ skew(a))
-    D[..., half + 9] = (toward @ (v_mps[:, :, None] + swept)[..., None])[..., 0]
-    D[..., :half] = -D[..., half:]
+    moving = v_mps[:, :, None] + swept
+    D[..., half + 9] = (toward @ moving[..., None])[..., 0]
+    D[..., :half] = -D[..., half:WIDTH]
     D[..., 3:6] = -toward * times_s[..., None, None, None]
+    seen_moving = (toward @ (moving - state.v_mps[i][:, None, None])[..., None])[..., 0]
+    D[..., WIDTH] = seen_moving + X @ skew(rates_radps[i])[:, None]
     return X, D
 
 

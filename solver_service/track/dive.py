@@ -118,7 +118,7 @@ def smooth(
         del first, parts
         only = _empty_filter(records, told_ns, CLOCK_WITHOUT_S)
         pass_over(only, records, fixes)
-        return replace(_of_guessed_motion(records, only, outputs_ns), clock_sigma_s=math.inf)
+        return replace(_of_guessed_motion(records, only, fixes, outputs_ns), clock_sigma_s=math.inf)
     shares = reduce(Shares.plus, [part.shares for part in parts]).best()
     known = PassedOver(records, first.epoch_ns or 0, clock_ns, shares, Walking())
     if all(part.lone for part in parts):
@@ -245,7 +245,9 @@ def _empty_filter(records: Records, clock_ns: int, clock_sigma_s: float) -> Trac
     return track
 
 
-def _of_guessed_motion(records: Records, first: TrackFilter, outputs_ns: Sequence[int]) -> Smoothed:
+def _of_guessed_motion(
+    records: Records, first: TrackFilter, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
+) -> Smoothed:
     """Give the tracks of a first pass over nodes without inertial units.
 
     Each is passed over again. Where that does not settle, the first pass's path stands.
@@ -263,6 +265,7 @@ def _of_guessed_motion(records: Records, first: TrackFilter, outputs_ns: Sequenc
             part.walking,
             guessed=guessed,
             clock_sigma_s=CLOCK_WITHOUT_S,
+            fixes=[(first.between(fix.stamp_ns), fix) for fix in fixes],
         )
         again = settled(path, part.detection, part.shaking, known, sum(part.told_by), doubtful=False)
         found.append(again or (first, path))

@@ -9,7 +9,7 @@ from itertools import islice
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.rotation import Floats, rotation_log
+from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.estimate import Estimate, alike, lead
 from buddyline.solver_service.track.forecasts import TOGETHER, DueRow, Forecast, Way, make_rows, of_state
@@ -17,7 +17,7 @@ from buddyline.solver_service.track.inputs import AttitudeSeen, FixSeen, TrackNo
 from buddyline.solver_service.track.intake import newest_before
 from buddyline.solver_service.track.lights import BLOCK, Sight
 from buddyline.solver_service.track.moving import HOLD_S, excerpt
-from buddyline.solver_service.track.output import TrackRow, at_one_time, at_one_time_jacobian, pose_jacobian
+from buddyline.solver_service.track.output import CONTRADICTS, TrackRow, fix_chi2
 from buddyline.solver_service.track.pool import MAX_TENTATIVE, TrackPool
 from buddyline.solver_service.track.start import CLOCK_S, state_from_fix
 from buddyline.solver_service.track.state import CLOCK, State, place_covariance
@@ -59,8 +59,6 @@ LOST_SHARE: Final = 0.3
 LOST_RANGE_M: Final = 10.0
 # What iron near a compass, or haste, adds to an attitude's sigmas (roll, pitch, yaw) when a start is checked.
 IRON_RAD: Final = np.radians((1.0, 1.0, 8.0))
-# A fix contradicts beyond this chi^2 of 6 degrees of freedom, an attitude beyond it of 3: chances of 1e-5 and 3e-7.
-CONTRADICTS: Final = 33.0
 # So do fixes on end whose chi^2 has a running mean above this (the newest counts 0.3). A sound track has 1 to 2, for
 # a fix is made of lights that the track has used; one with wrong first updates can stay below 33 for long. Fixes that
 # contradict by themselves do not count: a sound one after them must agree.
@@ -250,12 +248,7 @@ class TrackFilter(TrackPool):
     def _gap_chi2(self, estimate: Estimate, t_s: float, fix: FixSeen) -> float:
         """Return chi^2 (of 6) of the difference between a fix and the predicted pose."""
         state, P = self._predict(estimate, t_s)
-        now = at_one_time(state, estimate.rates_radps)
-        J = (pose_jacobian(now) @ at_one_time_jacobian(state, estimate.rates_radps))[:6]
-        toward = now.R[0].T
-        gap = np.concatenate((fix.t_a_b_m - toward @ now.r_m, rotation_log(fix.R_a_b @ (toward @ now.R[1]).T)))
-        S = J @ P[BLOCK] @ J.T + fix.covariance + np.diag([1e-4] * 3 + [1e-5] * 3)
-        return float(gap @ np.linalg.solve(S, gap))
+        return fix_chi2(state, P[BLOCK], estimate.rates_radps, fix)
 
     def _start(self, t_s: float, fix: FixSeen) -> Estimate | None:
         attitudes = [newest_before(of_node, t_s + HOLD_S) for of_node in self.attitudes]

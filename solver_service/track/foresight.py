@@ -89,7 +89,7 @@ def _foreseen(
         if at is None or later is None or not in_picture(camera, at):
             continue
         bearing, tangents = (values[0] for values in camera.rays(at[None]))
-        J = tangents @ D[0, light] / float(bearing @ X[0, light])
+        J = tangents @ D[0, light, :, :-1] / float(bearing @ X[0, light])
         px_per_rad = math.hypot(*tangents[0].tolist())
         range_m = math.hypot(*X[0, light].tolist())
         # Twice the integral of an unknown acceleration: of the turn, and of the way seen from so far.

@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.camera import Camera
+from buddyline.solver_service.geometry.observation import STAMP_SIGMA_S
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, skew
 from buddyline.solver_service.track.state import CLOCK, NAV, State
@@ -24,14 +25,16 @@ def light_positions(
 ) -> tuple[Floats, Floats]:
     """Give the other node's lights (L, 3) in the observer's camera frame at times dt_s (K,) after the state's.
 
-    Returns X (K, L, 3) and D (K, L, 3, NAV + 1): dX by the errors of COLUMNS. rates_radps (2, 3): turn rates. Where all
-    times are one, or there is none, K is 1. A batch of states has leading axes, and so have rates, times, X and D.
+    Returns X (K, L, 3) and D (K, L, 3, NAV + 2): dX by the errors of COLUMNS, and by the picture's own time.
+    rates_radps (2, 3): turn rates. Where all times are one, or there is none, K is 1. A batch of states has leading
+    axes, and so have rates, times, X and D.
     Seen by A:  X = R_A^T (r + R_B l)
                 dX = R_A^T (dr + dt dv - [r + R_B l]x (phi_B - phi_A)) + R_A^T (v + R_B (w_B x l)) dclock
     Seen by B:  X = R_B^T d, d = R_A l - r
                 dX = R_B^T (-dr - dt dv - [r + d]x (phi_A - phi_B)) - R_B^T R_A (w_A x l) dclock
     With B's clock ahead by dclock more than believed, what is called B's state at t was true dclock earlier. The
-    displacement that A's own unknown velocity adds is counted to r.
+    displacement that A's own unknown velocity adds is counted to r. Between two times of one picture
+                dX/dt = R_A^T (v + R_B (w_B x l)) - w_A x X,    seen by B:  R_B^T (-v + R_A (w_A x l)) - w_B x X
     """
     other = 1 - observer
     # Without a rolling shutter all candidates are of one time.
@@ -51,7 +54,7 @@ def light_positions(
     d = sign * r + arms
     toward = np.swapaxes(R_observer, -1, -2)[..., None, :, :]  # (T, 1, 3, 3)
     X = (toward @ d[..., None])[..., 0]
-    D = np.zeros((*X.shape, NAV + 1))
+    D = np.zeros((*X.shape, NAV + 2))
     D[..., 0:3] = sign * toward
     D[..., 3:6] = D[..., 0:3] * ahead_s[..., None, None, None]
     turn = toward @ skew((arms if observer == 0 else d) + r_m[..., None, :])
@@ -59,7 +62,16 @@ def light_positions(
     D[..., 9:12] = -D[..., 6:9]
     clock = v_mps[..., None, :] + swept if observer == 0 else -swept
     D[..., NAV] = (toward @ clock[..., None])[..., 0]
+    moving = (toward @ (sign * v_mps[..., None, :] + swept)[..., None])[..., 0]
+    D[..., NAV + 1] = moving + X @ skew(rates_radps[..., observer, None, :])
     return X, D
+
+
+def with_stamp(P: Floats) -> Floats:
+    """Give the covariance (..., C + 1, C + 1) of errors of covariance P (..., C, C), and of a picture's stamp."""
+    both = np.zeros((*P.shape[:-2], P.shape[-1] + 1, P.shape[-1] + 1))
+    both[..., :-1, :-1], both[..., -1, -1] = P, STAMP_SIGMA_S**2
+    return both
 
 
 def turns_over(rate_radps: Floats, times_s: Floats) -> Floats:

@@ -8,13 +8,16 @@ from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.direction import direction_of
-from buddyline.solver_service.geometry.rotation import Floats, inner, matrix_to_quat, rotation_exp, skew
+from buddyline.solver_service.geometry.rotation import Floats, inner, matrix_to_quat, rotation_exp, rotation_log, skew
+from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.lights import COLUMNS
 from buddyline.solver_service.track.state import NAV, PHI, R_, V_, State
 from numpy.typing import NDArray
 
 # A position no better than this share of the range is not told.
 WORST_SHARE: Final = 0.2
+# A fix contradicts beyond this chi^2 of 6 degrees of freedom, an attitude beyond it of 3: chances of 1e-5 and 3e-7.
+CONTRADICTS: Final = 33.0
 # a x b = _ACROSS (a b^T), the product's nine numbers row by row.
 _ACROSS: Final = -skew(np.eye(3)).reshape(3, 9)
 
@@ -81,6 +84,16 @@ def pose_jacobian(now: State) -> Floats:
     J[..., 9:12, R_] = np.eye(3)
     J[..., 9:12, PHI[1]] = -across
     return J
+
+
+def fix_chi2(state: State, P: Floats, rates_radps: Floats, fix: FixSeen) -> float:
+    """Give chi^2 (of 6) of the difference between a fix and a state with the covariance P (C, C) of COLUMNS."""
+    now = at_one_time(state, rates_radps)
+    J = (pose_jacobian(now) @ at_one_time_jacobian(state, rates_radps))[:6]
+    toward = now.R[0].T
+    gap = np.concatenate((fix.t_a_b_m - toward @ now.r_m, rotation_log(fix.R_a_b @ (toward @ now.R[1]).T)))
+    S = J @ P @ J.T + fix.covariance + np.diag([1e-4] * 3 + [1e-5] * 3)
+    return float(gap @ np.linalg.solve(S, gap))
 
 
 def _bent(C: Floats) -> Floats:

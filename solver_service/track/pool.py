@@ -13,7 +13,7 @@ from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.inputs import TrackNode
 from buddyline.solver_service.track.intake import newest_before
 from buddyline.solver_service.track.lamps import LampWatch
-from buddyline.solver_service.track.lights import BLOCK, Sight
+from buddyline.solver_service.track.lights import BLOCK, Sight, with_stamp
 from buddyline.solver_service.track.lone import fits, state_of
 from buddyline.solver_service.track.moving import HOLD_S
 from buddyline.solver_service.track.search import starts
@@ -248,7 +248,7 @@ class TrackPool(TrackSteps):
         if len(self.challengers) > 3 * MAX_TENTATIVE:
             return
         self._step(estimate, t_s, None)
-        state, rates_radps, P = estimate.state, estimate.rates_radps, estimate.covariance[BLOCK]
+        state, rates_radps, P = estimate.state, estimate.rates_radps, with_stamp(estimate.covariance[BLOCK])
         *_, y, H = self._compared(sight, state, rates_radps, sight.t_s - estimate.t_s)
         log_clutter = math.log(sight.clutter / self.nodes[sight.node].rig.camera.area_px2)
         for k in range(len(y)):

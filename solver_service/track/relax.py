@@ -21,9 +21,11 @@ from buddyline.solver_service.track.ahead import told_steps
 from buddyline.solver_service.track.association import LIKELY, Association
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.guessing import GuessedMotion
+from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.lamps import LampWatch
 from buddyline.solver_service.track.lights import Sight, in_picture, pixel_of
 from buddyline.solver_service.track.moving import HOLD_S
+from buddyline.solver_service.track.output import CONTRADICTS, fix_chi2
 from buddyline.solver_service.track.records import Records, pass_over
 from buddyline.solver_service.track.search import FURTHEST_M
 from buddyline.solver_service.track.seeing import (
@@ -34,6 +36,7 @@ from buddyline.solver_service.track.seeing import (
     in_front,
     learn_detection,
     light_rows,
+    stacked,
     told_by,
 )
 from buddyline.solver_service.track.shaking import Shaking
@@ -62,9 +65,10 @@ PASSES: Final = 24
 STAYS_SIGMAS: Final = 1.0
 DOUBTFUL_SIGMAS: Final = 0.3
 LOOKED_AT: Final = 10
-# Where motion is guessed, a dive is passed over so often at least, for each pass learns more of it. The last pass must
-# use this share of the pictures that the first path used, of each node: one that uses fewer has gone astray.
-GUESSING_PASSES: Final = 3
+# Where motion is guessed, a dive is passed over so often at least, for each pass learns more of it. The first pass
+# keeps the lights: by the motion that a filter guesses, half of a node's pictures may seem to have none. The last pass
+# must use this share of the pictures that the first path used, of each node: one that uses fewer has gone astray.
+GUESSING_PASSES: Final = 4
 GUESSING_TOLD: Final = 0.95
 # A doubtful track may settle at a wrong path. There is a track where chi^2 of each residual is below UNFIT, on average,
 # and the last pass uses LEAST_TOLD of the first one's pictures.
@@ -85,7 +89,7 @@ class PassedOver:
 
     epoch_ns: of the path's times. clock_ns: how far B's clock is believed ahead. shares (2, 2): as `take_off` takes
     them. walking: how far biases walk. unrest, guessed: as in TrackMoves; guessed is learned anew from pass to pass.
-    clock_sigma_s: 1 sd of the clocks' offset.
+    clock_sigma_s: 1 sd of the clocks' offset. fixes: each at its time, where motion is guessed.
     """
 
     records: Records
@@ -96,6 +100,7 @@ class PassedOver:
     unrest: float = 1.0
     guessed: GuessedMotion | None = None
     clock_sigma_s: float = CLOCK_S
+    fixes: Sequence[tuple[float, FixSeen]] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,10 +124,13 @@ class _ToldStep:
 class PathPass(TrackSteps):
     """Filters the errors against a path, whose steps it repeats.
 
-    detection (2, 2): how likely each light is found. passed: the estimate, to be smoothed about the same path.
+    detection (2, 2): how likely each light is found. keeps: whether the path's lights are kept, not decided again.
+    passed: the estimate, to be smoothed about the same path.
     """
 
-    def __init__(self, known: PassedOver, path: Path, detection: Floats, shaking: Shaking) -> None:
+    def __init__(
+        self, known: PassedOver, path: Path, detection: Floats, shaking: Shaking, *, keeps: bool = False
+    ) -> None:
         super().__init__((known.records[0].node, known.records[1].node), keep_s=math.inf)
         self.epoch_ns, self.clock_ns = known.epoch_ns, known.clock_ns
         self.unrest, self.guessed = known.unrest, known.guessed
@@ -146,7 +154,7 @@ class PathPass(TrackSteps):
             walking=known.walking,
             learns=False,
         )
-        self._path, self._k, self._off = path, 0, told.minus(first)
+        self._path, self._k, self._off, self._keeps = path, 0, told.minus(first), keeps
         self._open(self.passed)
         self.passed.steps.last = replace(self.passed.steps.last, before=self._off, after=self._off)
         # The shaking that a run's steps are worked out with.
@@ -252,7 +260,7 @@ class PathPass(TrackSteps):
             y, H, variance = depth
             off = float(y[0] - H[0] @ self._off)
             if off * off < DEPTH_GATE * (float(H[0] @ main.covariance @ H[0]) + variance):
-                rows.append((H, y, np.array((variance,))))
+                rows.append((H, y, np.array(((variance,),))))
         for sight, by_path in seen:
             main.trigger = [one for one in main.trigger if abs(sight.t_s - one[0]) < ONE_TRIGGER_S]
             found = self._associated(sight, by_path)
@@ -264,8 +272,7 @@ class PathPass(TrackSteps):
                 main.trigger += used
                 main.told_by[sight.node] += 1
         if rows:
-            H, y = np.concatenate([each[0] for each in rows]), np.concatenate([each[1] for each in rows])
-            noise = np.diag(np.concatenate([each[2] for each in rows]))
+            H, y, noise = stacked(rows)
             others = len(y) - 2 * len(lights)
             error, chi2 = told_by(main, H, y - H @ self._off, noise, teaches=bool(lights), others=others)
             self._off = self._off + error
@@ -283,7 +290,7 @@ class PathPass(TrackSteps):
         )
 
     def _associated(self, sight: Sight, by_path: BySight) -> Association:
-        """Decide which of a picture's candidates are lights, by the path."""
+        """Decide which of a picture's candidates are lights, by the path, or keep those that the path has."""
         main, observer, camera = self.passed, sight.node, self.nodes[sight.node].rig.camera
         inside = [in_picture(camera, pixel_of(camera, X), EDGE_PX) for X in by_path.X]
         found = by_path.odds.associate(sight.sigma_px, main.detection[observer], np.array(inside, dtype=float), LIKELY)
@@ -291,7 +298,8 @@ class PathPass(TrackSteps):
         learn_detection(main.detection[observer], inside, found.seen)
         if all(inside):
             self.lamps.take(1 - observer, sight.t_s, found.seen)
-        return replace(found, chosen=in_front(found.chosen, by_path.y))
+        chosen = self.guides[observer, sight.stamp_ns].look.chosen if self._keeps else found.chosen
+        return replace(found, chosen=in_front(chosen, by_path.y))
 
     def _apply(self, estimate: Estimate, H: Floats, y: Floats, noise: Floats, *, teaches: bool = False) -> float:
         error, chi2 = told_by(estimate, H, y - H @ self._off, noise, teaches=teaches)
@@ -315,10 +323,11 @@ def settled(
         b.between(start_ns - S_NS + shift_ns, end_ns + S_NS + shift_ns),
     )
     guesses, used = known.guessed is not None, _used(path)
+    contradicted = _contradicted(path, known.fixes)
     for count in range(1, PASSES + 1):
         if known.guessed is not None:
             known = replace(known, guessed=known.guessed.relearned(path))
-        track = PathPass(known, path, detection, shaking)
+        track = PathPass(known, path, detection, shaking, keeps=guesses and count == 1)
         pass_over(track, records, ())
         passed = track.passed
         old, path, detection = path, smoothed(passed.steps, path, auxiliary=guesses), passed.detection
@@ -326,7 +335,7 @@ def settled(
         passed.steps = Trail()
         if not bool(np.isfinite(path.states).all()):
             return None
-        learned = not guesses or count >= GUESSING_PASSES
+        learned = not guesses or (count >= GUESSING_PASSES and _contradicted(path, known.fixes) <= contradicted)
         if learned and _stays(old, path, DOUBTFUL_SIGMAS if doubtful else STAYS_SIGMAS):
             left_s = path.state(-1).clock_s
             # What a doubtful track, or one without a gyro, tells of the clocks is little, and less than it believes.
@@ -339,6 +348,16 @@ def settled(
             near = np.linalg.norm(path.states[:, R_], axis=1).max() < FURTHEST_M
             return (track, path) if near and (fits or not (doubtful or guesses)) else None
     return None
+
+
+def _contradicted(path: Path, fixes: Sequence[tuple[float, FixSeen]]) -> int:
+    """Count the fixes, each at its time, that contradict a path."""
+    count = 0
+    for t_s, fix in fixes:
+        k = int(np.abs(path.t_s - t_s).argmin())
+        if abs(path.t_s[k] - t_s) < ONE_TRIGGER_S:
+            count += fix_chi2(path.state(k), path.covariance(k), path.rates_radps[k], fix) > CONTRADICTS
+    return count
 
 
 def _used(path: Path) -> NDArray[np.int64]:

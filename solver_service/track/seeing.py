@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from buddyline.solver_service.geometry.observation import STAMP_SIGMA_S
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.association import LIKELY, SURE, Association, Odds, associate, odds_of
@@ -20,6 +21,7 @@ from buddyline.solver_service.track.lights import (
     light_positions,
     residuals,
     share_within,
+    with_stamp,
 )
 from buddyline.solver_service.track.moving import KNOWN_CLOCK_S, TrackMoves
 from buddyline.solver_service.track.smoother import Path
@@ -35,6 +37,7 @@ from buddyline.solver_service.track.state import (
 )
 from buddyline.solver_service.track.sudden import SuddenTurn, with_sudden
 from buddyline.solver_service.track.trail import Chosen, Look
+from numpy.typing import NDArray
 
 # Both nodes' pictures of one trigger are less than this apart.
 ONE_TRIGGER_S: Final = 0.03
@@ -102,7 +105,7 @@ class TrackSights(TrackMoves):
         place = place_covariance(estimate.state, estimate.covariance)
         share = math.sqrt(place.trace()) / float(np.linalg.norm(estimate.state.r_m))
         wide, estimate.wide = share > 0.1, share > WIDE_SHARE
-        within = share_within(camera, X[0], D[0], estimate.covariance[BLOCK], EDGE_PX)
+        within = share_within(camera, X[0], D[0], with_stamp(estimate.covariance[BLOCK]), EDGE_PX)
         inside = (within > INSIDE).tolist()
         guide = self.guides.get((observer, sight.stamp_ns))
         # A start that followed doubtful lights would seem better founded than it is.
@@ -117,7 +120,7 @@ class TrackSights(TrackMoves):
             clutter = sight.clutter / camera.area_px2
 
             def likely(P: Floats) -> Association:
-                return associate(y, H, P[BLOCK], sight.sigma_px, detection, clutter, within, least)
+                return associate(y, H, with_stamp(P[BLOCK]), sight.sigma_px, detection, clutter, within, least)
 
             found, estimate.covariance, turn = with_sudden(estimate, self._turning_s(estimate), likely)
         if wide and found.chosen and estimate.confirmed:
@@ -182,13 +185,15 @@ class TrackSights(TrackMoves):
         y, H = residuals(bearings, tangents, X, D)
         P = path.covariance(at)
         # The rows of lights that a picture did not use stay 0, and tell nothing.
-        H_used, y_used, R = np.zeros((len(seen), 4, len(COLUMNS))), np.zeros((len(seen), 4)), np.ones((len(seen), 4))
+        H_used, y_used = np.zeros((len(seen), 4, len(COLUMNS) + 1)), np.zeros((len(seen), 4))
+        R = np.ones((len(seen), 4))
         for n, (guide, _) in enumerate(seen):
             for row, (k, light, variance) in enumerate(in_front(guide.look.chosen, y[n])):
                 rows = slice(2 * row, 2 * row + 2)
                 H_used[n, rows], y_used[n, rows], R[n, rows] = H[n, k, light], y[n, k, light], variance
+        H_used, late = H_used[..., :-1], STAMP_SIGMA_S * H_used[..., -1:]
         across = P @ np.swapaxes(H_used, 1, 2)
-        rest = R[:, :, None] * np.eye(4) - H_used @ across
+        rest = R[:, :, None] * np.eye(4) + late * np.swapaxes(late, 1, 2) - H_used @ across
         # Rounding, and pictures that share a step, can leave less than nothing.
         values, vectors = np.linalg.eigh(rest)
         least = 0.02 * np.where(H_used.any(axis=2), R, np.inf).min(axis=1, keepdims=True)
@@ -196,11 +201,11 @@ class TrackSights(TrackMoves):
         inverse = (vectors / values[:, None]) @ np.swapaxes(vectors, 1, 2)
         gain = across @ inverse
         P = P + gain @ np.swapaxes(across, 1, 2)
-        y_without = y + (H @ (gain @ y_used[..., None])[:, None, None])[..., 0]
+        y_without = y + (H[..., :-1] @ (gain @ y_used[..., None])[:, None, None])[..., 0]
         # Candidates that a picture does not have are nowhere.
         y_without[~bearings.any(axis=2)] = np.inf
         area_px2 = self.nodes[observer].rig.camera.area_px2
-        odds = odds_of(y_without, H, P, sigma_px, np.array([sight.clutter / area_px2 for _, sight in seen]))
+        odds = odds_of(y_without, H, with_stamp(P), sigma_px, np.array([sight.clutter / area_px2 for _, sight in seen]))
         return list(map(BySight, X[:, 0], y, H, odds))
 
     def _about(
@@ -216,15 +221,14 @@ class TrackSights(TrackMoves):
         for left in reversed(range(ABOUT_STEPS)):
             state, after_s = estimate.state.plus(error), sight.t_s - estimate.t_s
             *_, y, H = self._compared(sight, state, estimate.rates_radps, after_s)
-            y = y + H @ error[COLUMNS]
+            y = y + H[..., :-1] @ error[COLUMNS]
             if left and (near := in_front(chosen, y)):
-                rows_H, rows_y, variances = light_rows(near, y, H)
-                error = anchors.kalman(estimate.covariance, rows_H, rows_y, np.diag(variances)).error
+                error = anchors.kalman(estimate.covariance, *light_rows(near, y, H)).error
         return y, H
 
     def _update_lights(self, estimate: Estimate, found: Association, y: Floats, H: Floats, sight: Sight) -> None:
-        rows_H, rows_y, variances = light_rows(found.chosen, y, H)
-        chi2 = self._apply(estimate, rows_H, rows_y, np.diag(variances), teaches=True)
+        rows_H, rows_y, noise = light_rows(found.chosen, y, H)
+        chi2 = self._apply(estimate, rows_H, rows_y, noise, teaches=True)
         estimate.surprise += chi2
         estimate.told += len(rows_y)
         estimate.light_s = max(estimate.light_s, sight.t_s)
@@ -275,11 +279,33 @@ def learn_detection(detection: Floats, inside: Sequence[bool], seen: Floats) -> 
 
 
 def light_rows(chosen: Chosen, y: Floats, H: Floats) -> tuple[Floats, Floats, Floats]:
-    """Give Jacobians (2 N, SIZE), residuals (2 N,) and variances (2 N,) of the chosen candidates, of y and H of all."""
+    """Give Jacobians (2 N, SIZE), residuals (2 N,) and noise (2 N, 2 N) of a picture's chosen candidates, of y and H of
+    all."""
     rows_H = np.zeros((2 * len(chosen), SIZE))
-    rows_H[:, COLUMNS] = np.concatenate([H[k, light] for k, light, _ in chosen])
+    of_lights = np.stack([H[k, light] for k, light, _ in chosen])
+    rows_H[:, COLUMNS] = of_lights[..., :-1].reshape(2 * len(chosen), -1)
     rows_y = np.concatenate([y[k, light] for k, light, _ in chosen])
-    return rows_H, rows_y, np.repeat([variance for _, _, variance in chosen], 2)
+    variances = np.array([variance for _, _, variance in chosen])
+    return rows_H, rows_y, noise_of(variances, of_lights[..., -1], np.zeros(len(chosen)))
+
+
+def noise_of(variances: Floats, by_time: Floats, pictures: NDArray[Any]) -> Floats:
+    """Give the noise (2 N, 2 N) of lights: their own, and that of their pictures' stamps, which those of one share.
+
+    variances (N,): px^2. by_time (N, 2): how they move in their pictures, px/s. pictures (N,): which one each is in.
+    """
+    late, of = STAMP_SIGMA_S * by_time.ravel(), np.repeat(pictures, 2)
+    return np.diag(np.repeat(variances, 2)) + np.where(of[:, None] == of, np.outer(late, late), 0.0)
+
+
+def stacked(rows: Sequence[tuple[Floats, Floats, Floats]]) -> tuple[Floats, Floats, Floats]:
+    """Give Jacobians, residuals and noise of several independent measurements as those of one."""
+    H, y = np.concatenate([each[0] for each in rows]), np.concatenate([each[1] for each in rows])
+    noise = np.zeros((len(y), len(y)))
+    ends = np.cumsum([len(each[1]) for each in rows]).tolist()
+    for end, (*_, own) in zip(ends, rows, strict=True):
+        noise[end - len(own) : end, end - len(own) : end] = own
+    return H, y, noise
 
 
 def in_front(chosen: Chosen, y: Floats) -> Chosen:

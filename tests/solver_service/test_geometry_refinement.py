@@ -14,7 +14,7 @@ from buddyline.solver_service.geometry.se3 import SE3
 
 from tests.solver_service.scenes import IDEAL, ODD_A, ODD_B, PairScene, project, random_scene
 
-STILL = Motion(np.zeros(6), np.zeros((6, 6)))
+STILL = Motion(np.zeros(6), np.zeros((6, 6)), 0.0, 0.0)
 DISTORTED = Camera("pinhole", 1640, 1232, 1800.0, 1795.0, 830.0, 610.0, (-0.2, 0.08, 5e-4, -4e-4, 0.01))
 FISHEYE = Camera("fisheye", 1640, 1232, 900.0, 905.0, 815.0, 620.0, (-0.02, 0.006, -0.003, 0.0004))
 RIGS = {
@@ -137,9 +137,9 @@ def test_sightings_of_a_moving_pair_are_brought_to_one_instant():
     dt_s = np.array([0.025, 0.027, -0.025, -0.026])
     scenes, views = moving(rng, RATES, dt_s, 40)
     seen, true = sightings(views), poses(scenes)
-    aware = refine(true, seen, IDEAL, IDEAL, Motion(RATES, 1e-12 * np.eye(6)), dt_s)
+    aware = refine(true, seen, IDEAL, IDEAL, Motion(RATES, 1e-12 * np.eye(6), 0.0, 0.0), dt_s)
     assert np.abs(errors(aware, scenes)).max() < 5e-4
-    unaware = refine(true, seen, IDEAL, IDEAL, Motion(np.zeros(6), 1e-12 * np.eye(6)), dt_s)
+    unaware = refine(true, seen, IDEAL, IDEAL, Motion(np.zeros(6), 1e-12 * np.eye(6), 0.0, 0.0), dt_s)
     assert np.abs(errors(unaware, scenes)).max() > 5e-3
 
 
@@ -151,7 +151,7 @@ def test_what_is_not_known_of_the_motion_is_in_the_covariance():
     for _ in range(60):
         scenes, views = moving(rng, 0.2 * rng.standard_normal(6), dt_s, 5)
         seen = sightings(views, rng, 0.5)
-        motion = Motion(np.zeros(6), spread)
+        motion = Motion(np.zeros(6), spread, 0.0, 0.0)
         aware += nees(refine(poses(scenes), seen, IDEAL, IDEAL, motion, dt_s), scenes).sum()
         unaware += nees(refine(poses(scenes), sightings(views, rng, 0.5), IDEAL, IDEAL), scenes).sum()
         total += 6 * len(scenes)
@@ -165,10 +165,24 @@ def test_clocks_that_disagree_are_in_the_covariance():
     for _ in range(60):
         skew = sigma_s * rng.standard_normal()
         scenes, views = moving(rng, RATES, np.array([0.5, 0.5, -0.5, -0.5]) * skew, 5)
-        motion = Motion(RATES, 1e-12 * np.eye(6), sigma_s)
+        motion = Motion(RATES, 1e-12 * np.eye(6), sigma_s, 0.0)
         sum_ += nees(refine(poses(scenes), sightings(views, rng, 0.5), IDEAL, IDEAL, motion), scenes).sum()
         total += 6 * len(scenes)
     assert sum_ / total == pytest.approx(1.0, abs=0.15)
+
+
+def test_stamps_that_are_off_are_in_the_covariance():
+    """Each picture's by itself, and both of its lights alike."""
+    rng = np.random.default_rng(9)
+    sigma_s, total, sums = 1e-3, 0, np.zeros(2)
+    motions = [Motion(5.0 * RATES, 1e-12 * np.eye(6), 0.0, stamps_s) for stamps_s in (sigma_s, 0.0)]
+    for _ in range(100):
+        scenes, views = moving(rng, motions[0].rates, np.repeat(sigma_s * rng.standard_normal(2), 2), 5)
+        seen = sightings(views, rng, 0.1)
+        sums += [nees(refine(poses(scenes), seen, IDEAL, IDEAL, motion), scenes).sum() for motion in motions]
+        total += 6 * len(scenes)
+    assert sums[0] / total == pytest.approx(1.0, abs=0.15)
+    assert sums[1] / total > 5.0
 
 
 def test_a_pose_that_the_lights_do_not_determine_is_not_sound():

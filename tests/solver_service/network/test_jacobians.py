@@ -83,12 +83,17 @@ def test_lights(pair: tuple[int, int]) -> None:
     dt_s = np.array((-0.004, 0.006))
     D = light_positions(state, [observer], [other], LIGHTS_M[None], rates, dt_s[None])[1][0]
     whole = np.zeros((*D.shape[:3], 1 + 3 * BLOCK))
-    whole[..., columns([observer], [other])[0]] = D
+    whole[..., columns([observer], [other])[0]] = D[..., :-1]
 
     def seen(error: Floats) -> Floats:
         return light_positions(state.plus(error), [observer], [other], LIGHTS_M[None], rates, dt_s[None])[0][0]
 
     assert whole == pytest.approx(differences(seen, 1 + 3 * BLOCK), abs=1e-6)
+    before, after = (
+        light_positions(state, [observer], [other], LIGHTS_M[None], rates, dt_s[None] + step)[0][0]
+        for step in (-1e-4, 1e-4)
+    )
+    assert D[..., -1] == pytest.approx((after - before) / 2e-4, abs=1e-6)
 
 
 def samples(state: NetState, member: int, at_s: float) -> tuple[Floats, Floats, Floats]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,11 +10,16 @@ import pytest
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track import dive as dive_module
 from buddyline.solver_service.track import relax
+from buddyline.solver_service.track.association import Association, Odds
 from buddyline.solver_service.track.dive import smooth
 from buddyline.solver_service.track.estimate import Estimate
+from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.guessing import LEAST, MOST, NEAR, GuessedMotion
 from buddyline.solver_service.track.moving import TrackMoves
 from buddyline.solver_service.track.output import TrackRow
+from buddyline.solver_service.track.parts import parts_of
+from buddyline.solver_service.track.records import pass_over
+from buddyline.solver_service.track.relax import PassedOver, _contradicted, settled
 from buddyline.solver_service.track.smoother import Path, smoothed
 from buddyline.solver_service.track.state import MOVING, SIZE, V_, State
 from buddyline.solver_service.track.trail import Look, Step, Trail
@@ -217,3 +223,62 @@ def test_passes_that_use_fewer_pictures_than_the_first_are_not_taken(
     places = [np.array([row.t_a_b_m for row in of]) for of in (again, refused, first)]
     assert np.abs(places[1] - places[2]).max() == 0.0
     assert np.abs(places[0] - places[2]).max() > 1e-4
+
+
+def first_pass(dive: KnownDive) -> tuple[Path, Estimate, PassedOver]:
+    """Give the path of a filter's pass over a dive, its estimate, and what the passes that follow begin with."""
+    first = TrackFilter(dive.records[0].node, dive.records[1].node, keep_s=math.inf, clock_sigma_s=0.003)
+    pass_over(first, dive.records, dive.fixes)
+    [part] = parts_of(first)
+    known = PassedOver(
+        dive.records,
+        first.epoch_ns or 0,
+        0,
+        np.zeros((2, 2)),
+        part.walking,
+        guessed=GuessedMotion.of(part.walking),
+        clock_sigma_s=0.003,
+        fixes=[(first.between(fix.stamp_ns), fix) for fix in dive.fixes],
+    )
+    return smoothed(part.steps, auxiliary=True), part, known
+
+
+def test_the_first_pass_keeps_the_lights_and_those_after_it_decide_again(
+    bare: KnownDive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here the odds speak for no light at all: all that is used has been kept."""
+    path, part, known = first_pass(bare)
+    used: list[int] = []
+
+    def settles_third(_: Path, new: Path, __: float) -> bool:
+        used.append(sum(bool(look.chosen) for looks in new.looks for look in looks))
+        return len(used) == 3
+
+    monkeypatch.setattr(Odds, "associate", lambda *_: Association((), np.zeros(2), 0.0))
+    monkeypatch.setattr(relax, "GUESSING_PASSES", 1)
+    monkeypatch.setattr(relax, "_stays", settles_third)
+    settled(path, part.detection, part.shaking, known, 0, doubtful=False)
+    assert used == [sum(bool(look.chosen) for looks in path.looks for look in looks), 0, 0]
+
+
+def test_passes_go_on_while_they_contradict_more_fixes_than_the_first_path(
+    bare: KnownDive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, part, known = first_pass(bare)
+    assert _contradicted(path, known.fixes) == 0
+    far = [(t_s, replace(fix, t_a_b_m=1.5 * fix.t_a_b_m)) for t_s, fix in known.fixes]
+    # One of them is damaged: it tells nothing.
+    assert _contradicted(path, far) == len(far) - 1 > 5
+    assert _contradicted(path, [(t_s + 1e3, fix) for t_s, fix in far]) == 0
+    counts: list[int] = []
+
+    def contradicted(*_: object) -> int:
+        counts.append(int(1 <= len(counts) < 4))
+        return counts[-1]
+
+    monkeypatch.setattr(relax, "GUESSING_PASSES", 1)
+    monkeypatch.setattr(relax, "_stays", lambda *_: True)
+    monkeypatch.setattr(relax, "_contradicted", contradicted)
+    assert settled(path, part.detection, part.shaking, known, 0, doubtful=False) is not None
+    # The first path's own; three passes that contradict one fix more; the one that is taken.
+    assert counts == [0, 1, 1, 1, 0]

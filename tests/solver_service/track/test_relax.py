@@ -9,7 +9,7 @@ from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track import relax, seeing
 from buddyline.solver_service.track.dive import smooth
 from buddyline.solver_service.track.estimate import Estimate
-from buddyline.solver_service.track.lights import COLUMNS, Sight
+from buddyline.solver_service.track.lights import COLUMNS, Sight, with_stamp
 from buddyline.solver_service.track.parts import parts_of
 from buddyline.solver_service.track.records import feed, pass_over
 from buddyline.solver_service.track.relax import PassedOver, PathPass
@@ -107,13 +107,15 @@ def test_pictures_are_weighed_together_by_all_the_dive_but_themselves() -> None:
             k, after_s = guide.step, guide.look.t_s - float(path.t_s[guide.step])
             *_, y, H = again._compared(sight, path.state(k), path.rates_radps[k], after_s)
             information, told = np.linalg.inv(path.covariance(k)), np.zeros(len(COLUMNS))
-            for at, light, variance in guide.look.chosen:
-                information = information - H[at, light].T @ H[at, light] / variance
-                told -= H[at, light].T @ y[at, light] / variance
+            if guide.look.chosen:
+                rows_H, rows_y, noise = seeing.light_rows(guide.look.chosen, y, H)
+                weighted = np.linalg.solve(noise, rows_H[:, COLUMNS])
+                information, told = information - weighted.T @ rows_H[:, COLUMNS], -weighted.T @ rows_y
             P = np.linalg.inv(information)
             clutter = sight.clutter / again.nodes[node].rig.camera.area_px2
             detection = np.array((0.9, 0.8))
-            cases, logs = weigh(y - H @ (P @ told), H, P, sight.sigma_px, detection, clutter)
+            left_over = y - H[..., :-1] @ (P @ told)
+            cases, logs = weigh(left_over, H, with_stamp(P), sight.sigma_px, detection, clutter)
             found, weighed = odds.weighed(detection)
             # Which of two that hardly differ stands first may change by rounding.
             assert sorted(map(str, found)) == sorted(map(str, cases))

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from buddyline.solver_service.geometry.observation import STAMP_SIGMA_S
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
 from buddyline.solver_service.track import seeing
 from buddyline.solver_service.track.association import Association, associate
@@ -20,14 +21,14 @@ from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.lights import COLUMNS, Sight, light_positions, residuals, sight_of
 from buddyline.solver_service.track.moving import HOLD_S, KNOWN_CLOCK_S
 from buddyline.solver_service.track.records import last_ns
-from buddyline.solver_service.track.seeing import _widened, light_rows
+from buddyline.solver_service.track.seeing import _widened, light_rows, noise_of, stacked
 from buddyline.solver_service.track.state import CLOCK, MOVING, PHI, R_, SIZE, V_, State
 from buddyline.solver_service.track.strapdown import Noise
 from buddyline.solver_service.track.trail import Chosen
 from buddyline.solver_service.track.walking import Walking
 
 from tests.solver_service.track.dives import Setting, filter_of, make
-from tests.solver_service.track.test_track_jacobians import LIGHTS_M, a_state
+from tests.solver_service.track.test_track_jacobians import LIGHTS_M, PINHOLE, a_state
 
 SIGMA_RAD = 0.02
 STEP_S = 0.05
@@ -38,7 +39,7 @@ def of_light(state: State, sight: Sight) -> tuple[Floats, Floats]:
     X, D = light_positions(state, 0, LIGHTS_M, np.zeros((2, 3)), sight.dt_s)
     y, H = residuals(sight.bearings, sight.tangents, X, D)
     full = np.zeros((2, SIZE))
-    full[:, COLUMNS] = H[0, 0]
+    full[:, COLUMNS] = H[0, 0, :, :-1]
     return y[0, 0], full
 
 
@@ -200,3 +201,32 @@ def test_lights_after_seconds_of_darkness_are_believed_where_they_are() -> None:
             X, D = light_positions(estimate.state, sight.node, lights_m, estimate.rates_radps, sight.dt_s)
             y, _ = residuals(sight.bearings, sight.tangents, X, D)
             assert np.abs(np.array((y[0, 0], y[1, 1]))).max() < 5.0
+
+
+def test_lights_of_a_picture_share_the_error_of_its_stamp() -> None:
+    state, rates = a_state(5), np.array(((0.1, -0.3, 0.2), (-0.4, 0.1, 0.3)))
+    bearings, tangents = PINHOLE.rays(np.array(((300.0, 250.0), (500.0, 350.0))))
+
+    def seen(late_s: float) -> tuple[Floats, Floats]:
+        return residuals(bearings, tangents, *light_positions(state, 1, LIGHTS_M, rates, np.full(2, late_s)))
+
+    (y, H), (later, _) = seen(0.0), seen(STAMP_SIGMA_S)
+    chosen = ((0, 0, 0.49), (1, 1, 0.25))
+    rows_H, rows_y, noise = light_rows(chosen, y, H)
+    moved = np.concatenate((later[0, 0] - y[0, 0], later[1, 1] - y[1, 1]))
+    assert np.abs(moved).max() > 0.2
+    assert noise == pytest.approx(np.diag((0.49, 0.49, 0.25, 0.25)) + np.outer(moved, moved), rel=0.01, abs=1e-4)
+    assert rows_y == pytest.approx(np.concatenate((y[0, 0], y[1, 1])))
+    assert rows_H[2:, COLUMNS] == pytest.approx(H[1, 1, :, :-1])
+    others = noise_of(np.array((0.49, 0.25)), H[[0, 1], [0, 1], :, -1], np.array((7, 8)))
+    assert others[:2, :2] == pytest.approx(noise[:2, :2])
+    assert np.all(others[:2, 2:] == 0.0)
+
+
+def test_measurements_of_one_step_are_stacked() -> None:
+    one = np.ones((1, 3)), np.array((2.0,)), np.array(((4.0,),))
+    two = np.zeros((2, 3)), np.array((5.0, 6.0)), np.array(((7.0, 1.0), (1.0, 8.0)))
+    H, y, noise = stacked([one, two])
+    assert H.tolist() == [[1.0] * 3, [0.0] * 3, [0.0] * 3]
+    assert y.tolist() == [2.0, 5.0, 6.0]
+    assert noise.tolist() == [[4.0, 0.0, 0.0], [0.0, 7.0, 1.0], [0.0, 1.0, 8.0]]
