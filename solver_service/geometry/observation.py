@@ -162,7 +162,7 @@ class Settings:
 
     @property
     def still(self) -> bool:
-        """Whether all exposures of a trigger were at the same instant, as far as is known without their stamps."""
+        """Whether clocks and stamps are taken for exact."""
         return self.skew_sigma_s == 0.0 and self.stamp_sigma_s == 0.0
 
     @cached_property

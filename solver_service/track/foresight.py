@@ -13,7 +13,7 @@ from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.forecasts import Forecast, StateNow
 from buddyline.solver_service.track.inputs import TrackNode
-from buddyline.solver_service.track.lights import in_picture, light_positions, pixel_of
+from buddyline.solver_service.track.lights import in_picture, light_positions, pixel_of, with_stamp
 from buddyline.solver_service.track.moving import HOLD_S
 from buddyline.solver_service.track.state import State
 
@@ -81,7 +81,7 @@ def foresee(track: TrackFilter, known_ns: int, stamps_ns: Mapping[int, int]) -> 
 def _foreseen(
     camera: Camera, lights_m: Floats, observer: int, lit: Sequence[int], ahead_s: float, present: StateNow
 ) -> list[ForeseenLight]:
-    P, times_s = present.covariance, np.array((ahead_s, ahead_s + STEP_S))
+    P, times_s = with_stamp(present.covariance), np.array((ahead_s, ahead_s + STEP_S))
     X, D = light_positions(State(present.row), observer, lights_m, present.rates_radps, times_s)
     found = []
     for light in lit:
@@ -89,7 +89,7 @@ def _foreseen(
         if at is None or later is None or not in_picture(camera, at):
             continue
         bearing, tangents = (values[0] for values in camera.rays(at[None]))
-        J = tangents @ D[0, light, :, :-1] / float(bearing @ X[0, light])
+        J = tangents @ D[0, light] / float(bearing @ X[0, light])
         px_per_rad = math.hypot(*tangents[0].tolist())
         range_m = math.hypot(*X[0, light].tolist())
         # Twice the integral of an unknown acceleration: of the turn, and of the way seen from so far.

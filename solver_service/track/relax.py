@@ -16,7 +16,7 @@ from typing import Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
-from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
 from buddyline.solver_service.track.ahead import told_steps
 from buddyline.solver_service.track.association import LIKELY, Association
 from buddyline.solver_service.track.estimate import Estimate
@@ -70,6 +70,8 @@ LOOKED_AT: Final = 10
 # must use this share of the pictures that the first path used, of each node: one that uses fewer has gone astray.
 GUESSING_PASSES: Final = 4
 GUESSING_TOLD: Final = 0.95
+# A pass has gone astray, too, where it contradicts more fixes than the first path, and this share of all on top.
+MORE_CONTRADICTED: Final = 0.01
 # A doubtful track may settle at a wrong path. There is a track where chi^2 of each residual is below UNFIT, on average,
 # and the last pass uses LEAST_TOLD of the first one's pictures.
 UNFIT: Final = 1.5
@@ -292,14 +294,17 @@ class PathPass(TrackSteps):
     def _associated(self, sight: Sight, by_path: BySight) -> Association:
         """Decide which of a picture's candidates are lights, by the path, or keep those that the path has."""
         main, observer, camera = self.passed, sight.node, self.nodes[sight.node].rig.camera
+        if self._keeps:
+            # What the path says of the others is not believed, nor is anything learned from it.
+            kept = self.guides[observer, sight.stamp_ns].look.chosen
+            return Association(in_front(kept, by_path.y), np.zeros(2), 0.0)
         inside = [in_picture(camera, pixel_of(camera, X), EDGE_PX) for X in by_path.X]
         found = by_path.odds.associate(sight.sigma_px, main.detection[observer], np.array(inside, dtype=float), LIKELY)
         main.evidence += found.evidence
         learn_detection(main.detection[observer], inside, found.seen)
         if all(inside):
             self.lamps.take(1 - observer, sight.t_s, found.seen)
-        chosen = self.guides[observer, sight.stamp_ns].look.chosen if self._keeps else found.chosen
-        return replace(found, chosen=in_front(chosen, by_path.y))
+        return replace(found, chosen=in_front(found.chosen, by_path.y))
 
     def _apply(self, estimate: Estimate, H: Floats, y: Floats, noise: Floats, *, teaches: bool = False) -> float:
         error, chi2 = told_by(estimate, H, y - H @ self._off, noise, teaches=teaches)
@@ -323,7 +328,7 @@ def settled(
         b.between(start_ns - S_NS + shift_ns, end_ns + S_NS + shift_ns),
     )
     guesses, used = known.guessed is not None, _used(path)
-    contradicted = _contradicted(path, known.fixes)
+    contradicted = _contradicted(path, known.fixes) + MORE_CONTRADICTED * len(known.fixes)
     for count in range(1, PASSES + 1):
         if known.guessed is not None:
             known = replace(known, guessed=known.guessed.relearned(path))
@@ -335,8 +340,9 @@ def settled(
         passed.steps = Trail()
         if not bool(np.isfinite(path.states).all()):
             return None
-        learned = not guesses or (count >= GUESSING_PASSES and _contradicted(path, known.fixes) <= contradicted)
-        if learned and _stays(old, path, DOUBTFUL_SIGMAS if doubtful else STAYS_SIGMAS):
+        learned = not guesses or count >= GUESSING_PASSES
+        stays = learned and _stays(old, path, DOUBTFUL_SIGMAS if doubtful else STAYS_SIGMAS)
+        if stays and _contradicted(path, known.fixes) <= contradicted:
             left_s = path.state(-1).clock_s
             # What a doubtful track, or one without a gyro, tells of the clocks is little, and less than it believes.
             tells = not doubtful and not guesses
@@ -351,12 +357,16 @@ def settled(
 
 
 def _contradicted(path: Path, fixes: Sequence[tuple[float, FixSeen]]) -> int:
-    """Count the fixes, each at its time, that contradict a path."""
+    """Count the fixes, each at its time, that contradict a path: by its nearest step, carried on to that time."""
     count = 0
     for t_s, fix in fixes:
-        k = int(np.abs(path.t_s - t_s).argmin())
-        if abs(path.t_s[k] - t_s) < ONE_TRIGGER_S:
-            count += fix_chi2(path.state(k), path.covariance(k), path.rates_radps[k], fix) > CONTRADICTS
+        after = min(max(int(path.t_s.searchsorted(t_s)), 1), len(path) - 1)
+        k = after - int(t_s - path.t_s[after - 1] < path.t_s[after] - t_s)
+        on_s = t_s - path.t_s[k]
+        if abs(on_s) < ONE_TRIGGER_S:
+            step, rates_radps = path.state(k), path.rates_radps[k]
+            state = step.moved(step.r_m + on_s * step.v_mps, step.v_mps, step.R @ rotation_exp(on_s * rates_radps))
+            count += fix_chi2(state, path.covariance(k), rates_radps, fix) > CONTRADICTS
     return count
 
 

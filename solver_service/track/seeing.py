@@ -279,8 +279,10 @@ def learn_detection(detection: Floats, inside: Sequence[bool], seen: Floats) -> 
 
 
 def light_rows(chosen: Chosen, y: Floats, H: Floats) -> tuple[Floats, Floats, Floats]:
-    """Give Jacobians (2 N, SIZE), residuals (2 N,) and noise (2 N, 2 N) of a picture's chosen candidates, of y and H of
-    all."""
+    """Give Jacobians (2 N, SIZE), residuals (2 N,) and noise (2 N, 2 N) of a picture's chosen candidates.
+
+    y, H: of all its candidates, as `residuals` gives them.
+    """
     rows_H = np.zeros((2 * len(chosen), SIZE))
     of_lights = np.stack([H[k, light] for k, light, _ in chosen])
     rows_H[:, COLUMNS] = of_lights[..., :-1].reshape(2 * len(chosen), -1)

@@ -1,15 +1,18 @@
 """A simulated dive as a stream of messages."""
 
+import threading
 from collections import Counter
 from itertools import pairwise
 
 import cv2
 import numpy as np
 import pytest
+from buddyline.node.config import NodeConfig, SimulationConfig
+from buddyline.node.sim.devices import SimulatedCamera
 from buddyline.node.sim.dive import messages
 from buddyline.node.sim.scenario import DivePlan, Scenario
 from buddyline.node.sim.world import World
-from buddyline.protocol.clock import S_NS
+from buddyline.protocol.clock import S_NS, ManualClock, trigger_index
 from buddyline.protocol.codec import encode
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Candidates, CompressedImage, LightTruth, NodeInfo, Truth
@@ -56,10 +59,19 @@ def test_triggers_follow_the_protocol_and_exposures_have_jitter():
 
 def test_stamps_are_off_the_exposures_that_the_pictures_show():
     world = World(Scenario(seed=3, start_ns=START_NS))
-    for _, _, lights in _dive(DivePlan(seconds=3)):
-        if isinstance(lights, LightTruth):
-            taken_ns = lights.stamp_ns - world.stamp_error_ns(lights.node, lights.trigger)
-            assert lights.lights == world.light_truth(lights.node, taken_ns, lights.trigger).lights
+    for _, _, seen in _dive(DivePlan(seconds=3)):
+        if isinstance(seen, LightTruth | Candidates):
+            taken_ns = seen.stamp_ns - world.stamp_error_ns(seen.node, seen.trigger)
+            if isinstance(seen, LightTruth):
+                assert seen.lights == world.light_truth(seen.node, taken_ns, seen.trigger).lights
+            else:
+                assert seen.blobs == world.candidates(seen.node, taken_ns, seen.trigger, seen.seq, seen.boot).blobs
+    config = NodeConfig(node="a", simulation=SimulationConfig(seed=3, start_ns=START_NS))
+    camera = SimulatedCamera(config, ManualClock(START_NS))
+    frames = [camera.next_frame(threading.Event()) for _ in range(3)]
+    triggers = [trigger_index(frame.stamp_ns, config.trigger_period_ns) for frame in frames]
+    instants_ns = [trigger * config.trigger_period_ns + world.stamp_error_ns("a", trigger) for trigger in triggers]
+    assert [frame.stamp_ns for frame in frames] == instants_ns
     errors_ns = np.array([world.stamp_error_ns(node, trigger) for node in "ab" for trigger in range(200)])
     assert errors_ns.std() == pytest.approx(1e6, rel=0.15)
     exact = World(Scenario(seed=3, start_ns=START_NS, stamp_sigma_ns=0))

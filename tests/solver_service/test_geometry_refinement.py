@@ -185,6 +185,19 @@ def test_stamps_that_are_off_are_in_the_covariance():
     assert sums[1] / total > 5.0
 
 
+def test_of_an_unknown_motion_too_each_picture_alone_has_the_error_of_its_stamp():
+    """By the formula in plain numbers, for rows of both pictures and of sensors, which have no stamp."""
+    rng = np.random.default_rng(10)
+    rows, pictures = rng.standard_normal((1, 11, 7)), np.repeat((1.0, -1.0, 0.0), (4, 4, 3))
+    motion = Motion(RATES, np.diag(rng.uniform(0.1, 0.5, 6)), 0.0, 0.7)
+    J, noise = rows[0, :, :6], np.eye(11)
+    for picture in (1.0, -1.0):
+        moved = 0.7 * J * (pictures == picture)[:, None]
+        noise += moved @ (motion.covariance + np.outer(RATES, RATES)) @ moved.T
+    solved = at_one_instant(rows, np.zeros((1, 11)), pictures, motion)
+    np.testing.assert_allclose(solved.covariance[0], np.linalg.inv(J.T @ np.linalg.solve(noise, J)), rtol=1e-9)
+
+
 def test_a_pose_that_the_lights_do_not_determine_is_not_sound():
     """Both lights of B in one pixel: nothing tells its range."""
     scene = random_scene(np.random.default_rng(8), 5.0)

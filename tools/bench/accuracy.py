@@ -59,7 +59,8 @@ def over_bound(range_m: float, sigma_px: float, count: int) -> dict[str, Any]:
         covariance = pose_bounds(trigger.t_a_b_m[None], matrix_to_quat(trigger.R_a_b)[None], INFO, INFO, sigma_px)[0]
         bound += np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:])
         for method in METHODS:
-            settings = Settings(method=method, min_probability=0.0, range_max_m=60.0)
+            # All of these triggers' exposures are of one instant.
+            settings = Settings(method=method, min_probability=0.0, range_max_m=60.0, stamp_sigma_s=0.0)
             fix = trigger.solve(settings, sensors=False)
             if not isinstance(fix, Fix):
                 raise BuddylineError(f"{method} finds no pose at {range_m:g} m: {fix.detail}")

@@ -6,13 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from buddyline.solver_service.geometry.camera import Camera
+from buddyline.solver_service.geometry.observation import STAMP_SIGMA_S
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log, skew
 from buddyline.solver_service.network.belief import Member, within
-from buddyline.solver_service.network.estimate import NetEstimate, PairFix
+from buddyline.solver_service.network.estimate import Bar, NetEstimate, PairFix
 from buddyline.solver_service.network.filter import inverted
 from buddyline.solver_service.network.motion import Move, moved_members
-from buddyline.solver_service.network.sights import columns, light_positions
+from buddyline.solver_service.network.sights import WIDTH, columns, light_positions
 from buddyline.solver_service.network.state import (
     ACCEL_BIAS,
     BLOCK,
@@ -31,6 +32,7 @@ from buddyline.solver_service.network.state import (
 )
 from buddyline.solver_service.track.inputs import TrackNode
 from buddyline.solver_service.track.intake import TrackIntake
+from buddyline.solver_service.track.lights import Sight
 from buddyline.solver_service.track.strapdown import Noise, SampleGrid, integrate
 
 STEP = 1e-6
@@ -172,6 +174,25 @@ def an_estimate(state: NetState) -> NetEstimate:
     estimate.covariance = np.eye(1 + 3 * BLOCK)
     estimate.rates_radps = np.zeros((3, 3))
     return estimate
+
+
+def test_lights_of_one_picture_share_the_error_of_its_stamp_whosever_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Member 0 sees both others in one picture, member 1 one of them in another."""
+    estimate, rng = an_estimate(a_state(7)), np.random.default_rng(8)
+    nothing = np.zeros(0)
+    one, two = (Sight(0, 0.0, node, np.zeros((0, 3)), np.zeros((0, 2, 3)), nothing, nothing) for node in (0, 1))
+    bars = [Bar(0, 1, one), Bar(0, 2, one), Bar(1, 2, two)]
+    which = columns([bar.observer for bar in bars], [bar.other for bar in bars])
+    y, H = rng.normal(0.0, 1.0, (3, 1, 2, 2)), rng.normal(0.0, 300.0, (3, 1, 2, 2, WIDTH + 1))
+    applied: list[tuple[Floats, Floats]] = []
+    monkeypatch.setattr(NetEstimate, "_apply", lambda _, rows, __, noise, **___: applied.append((rows, noise)))
+    estimate._update(bars, which, y, H, [(n, 0, n % 2, 0.5) for n in range(3)])
+    [(rows, noise)] = applied
+    late = STAMP_SIGMA_S * np.concatenate([H[n, 0, n % 2, :, -1] for n in range(3)])
+    expected = 0.5 * np.eye(6) + np.outer(late, late)
+    expected[:4, 4:] = expected[4:, :4] = 0.0
+    assert noise == pytest.approx(expected)
+    assert rows[4:, which[2]] == pytest.approx(H[2, 0, 0, :, :-1])
 
 
 def relative(state: NetState) -> tuple[Floats, Floats]:

@@ -19,7 +19,8 @@ from buddyline.solver_service.track.moving import TrackMoves
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.parts import parts_of
 from buddyline.solver_service.track.records import pass_over
-from buddyline.solver_service.track.relax import PassedOver, _contradicted, settled
+from buddyline.solver_service.track.relax import PassedOver, PathPass, _contradicted, settled
+from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.smoother import Path, smoothed
 from buddyline.solver_service.track.state import MOVING, SIZE, V_, State
 from buddyline.solver_service.track.trail import Look, Step, Trail
@@ -241,6 +242,28 @@ def first_pass(dive: KnownDive) -> tuple[Path, Estimate, PassedOver]:
         fixes=[(first.between(fix.stamp_ns), fix) for fix in dive.fixes],
     )
     return smoothed(part.steps, auxiliary=True), part, known
+
+
+def test_a_pass_that_keeps_the_lights_learns_nothing_of_how_likely_they_are_found(bare: KnownDive) -> None:
+    path, part, known = first_pass(bare)
+    track = PathPass(known, path, part.detection, part.shaking, keeps=True)
+    pass_over(track, known.records, ())
+    assert (track.passed.detection == part.detection).all()
+    assert track.passed.told > 200
+
+
+def test_a_whole_dives_passes_know_its_fixes(bare: KnownDive, monkeypatch: pytest.MonkeyPatch) -> None:
+    counts: list[tuple[int, int]] = []
+
+    def noted(path: Path, detection: Floats, shaking: Shaking, known: PassedOver, *told: int, doubtful: bool) -> None:
+        far = [(t_s, replace(fix, t_a_b_m=1.5 * fix.t_a_b_m)) for t_s, fix in known.fixes]
+        counts.append((_contradicted(path, known.fixes), _contradicted(path, far)))
+
+    monkeypatch.setattr(dive_module, "settled", noted)
+    smooth(bare.records, bare.fixes, bare.stamps_ns)
+    [(as_told, moved)] = counts
+    assert as_told == 0
+    assert moved > 5
 
 
 def test_the_first_pass_keeps_the_lights_and_those_after_it_decide_again(
