@@ -70,7 +70,7 @@ LOOKED_AT: Final = 10
 # must use this share of the pictures that the first path used, of each node: one that uses fewer has gone astray.
 GUESSING_PASSES: Final = 4
 GUESSING_TOLD: Final = 0.95
-# A pass has gone astray, too, where it contradicts more fixes than the first path, and this share of all on top.
+# One that contradicts more fixes than the first path, by more than this share of all, has gone astray, too.
 MORE_CONTRADICTED: Final = 0.01
 # A doubtful track may settle at a wrong path. There is a track where chi^2 of each residual is below UNFIT, on average,
 # and the last pass uses LEAST_TOLD of the first one's pictures.

@@ -28,6 +28,9 @@ def test_the_sample_is_solved_reported_and_right(here, capsys):
     assert "wrong poses (position off by more than 10% of the range): 0 of" in told
     assert "track (smooth): covers 100.0 %" in told
     dive = buddyline.open_dive("sample.mcap")
+    period_ns = dive.infos["a"].trigger_period_ns
+    pictured = [{round(stamp_ns / period_ns) for stamp_ns, _ in dive.pictures(node)} for node in "ab"]
+    assert len(pictured[0] & pictured[1]) > 10
     assert len(dive.depths("a")) > 100
 
 
