@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
+from buddyline.solver_service.track.between import rows_between
 from buddyline.solver_service.track.earlier import EARLIER_S, EarlierFilter
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
@@ -42,7 +43,7 @@ from buddyline.solver_service.track.records import (
     until_one_ended,
 )
 from buddyline.solver_service.track.relax import PassedOver, PathPass, clock_sigma_s, settled
-from buddyline.solver_service.track.smoother import Path, rows_between, smoothed
+from buddyline.solver_service.track.smoother import Path, smoothed
 from buddyline.solver_service.track.start import CLOCK_S
 from buddyline.solver_service.track.trail import Trail
 from buddyline.solver_service.track.vibration import Shares

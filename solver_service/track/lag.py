@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
+from buddyline.solver_service.track.between import rows_between
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.output import TrackRow
-from buddyline.solver_service.track.smoother import rows_between, smoothed
+from buddyline.solver_service.track.smoother import smoothed
 
 LAG_S: Final = 1.0
 # A pass backward serves all rows that have come due; so seldom it is cheap.

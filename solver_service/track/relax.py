@@ -335,7 +335,11 @@ def settled(
         track = PathPass(known, path, detection, shaking, keeps=guesses and count == 1)
         pass_over(track, records, ())
         passed = track.passed
-        old, path, detection = path, smoothed(passed.steps, path, auxiliary=guesses), passed.detection
+        old, path, detection = (
+            path,
+            smoothed(passed.steps, path, auxiliary=guesses, across=not guesses),
+            passed.detection,
+        )
         # Every step holds a covariance: those of two passes take twice the memory.
         passed.steps = Trail()
         if not bool(np.isfinite(path.states).all()):

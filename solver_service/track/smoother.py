@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log, skew
+from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.lights import COLUMNS
-from buddyline.solver_service.track.output import TrackRow, rows_of
-from buddyline.solver_service.track.shaking import SHAKEN_S
 from buddyline.solver_service.track.state import (
     CLOCK_COLUMN,
     GYRO_BIAS,
     MOVING,
-    NAV,
     PHI,
-    R_,
     ROW,
     SHAKE,
     SHOVE,
@@ -42,8 +38,6 @@ _DRAWN: Final = (
 )
 # The columns of the errors that change as divers like, where no unit tells: velocity, A's and B's turn rates.
 _FREE: Final = np.eye(SIZE)[:, np.r_[V_, GYRO_BIAS[0], GYRO_BIAS[1]]]
-# So many rows are made at once.
-TOGETHER: Final = 256
 # Over so many steps a turn rate's swings are averaged.
 SWINGS: Final = 20
 
@@ -53,11 +47,12 @@ class Path:
     """Smoothed steps as columns, in order of time.
 
     t_s, light_s (N,), lights (N,), rates_radps (N, 2, 3): of the steps. states: State.row of each. halves: of the
-    covariance of COLUMNS, its upper half. drawn (N, 5): variances that noise added in the step before: of A's and B's
-    attitude by shaking, of both by their samples, and of the velocity by shaking. without (N, 2): which node had no
+    covariance of COLUMNS, its upper half. drawn (N, 6): variances that noise added in the step before, of A's and B's
+    attitude and of the velocity: by shaking, and by all else. without (N, 2): which node had no
     inertial unit in that step. oldest (SIZE, SIZE): the whole covariance at the first step. auxiliary (N, 3, 3), where
     it was asked for: of the step before, for the velocity and for A's and B's turn rates, the auxiliary residual's
-    square (the sum of its axes), what that is expected to be, and the variance that noise added (one axis).
+    square (the sum of its axes), what that is expected to be, and the variance that noise added (one axis). across
+    (N, C, C), where it was asked for: the covariance of COLUMNS of the step before (rows) with each step (columns).
     """
 
     t_s: Floats
@@ -71,6 +66,7 @@ class Path:
     looks: Sequence[tuple[Look, ...]]
     oldest: Floats
     auxiliary: Floats
+    across: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         """Return the number of steps."""
@@ -111,13 +107,14 @@ class Path:
         return P
 
 
-def smoothed(steps: Trail, about: Path | None = None, *, auxiliary: bool = False) -> Path:
+def smoothed(steps: Trail, about: Path | None = None, *, auxiliary: bool = False, across: bool = False) -> Path:
     """Give the state and covariance of each step by all steps' measurements.
 
     Backward, C = P F^T (P-)^-1 with P- = F P F^T + Q; the state is off its filtered one by C (x+1 - x-), its covariance
     P + C (P+1 - P-) C^T. about: the path that these steps are linear about: errors are then taken against it, where
     they add up exactly. auxiliary: whether to give auxiliary residuals (Harvey and Koopman 1992),
-    s = (P-)^-1 (x+1 - x-): the noise was off by Q s. The covariance of s is (P-)^-1 (P- - P+1) (P-)^-1.
+    s = (P-)^-1 (x+1 - x-): the noise was off by Q s. The covariance of s is (P-)^-1 (P- - P+1) (P-)^-1. across: whether
+    to give the covariances of neighbours, C P+1 (de Jong and MacKinnon 1988).
     """
     count = len(steps)
     looks: list[tuple[Look, ...]] = [()] * count
@@ -129,11 +126,12 @@ def smoothed(steps: Trail, about: Path | None = None, *, auxiliary: bool = False
         rates_radps=np.empty((count, 2, 3)),
         states=np.empty((count, ROW)),
         halves=np.empty((count, len(_UPPER[0]))),
-        drawn=np.empty((count, 5)),
+        drawn=np.empty((count, 6)),
         without=np.empty((count, 2), dtype=bool),
         looks=looks,
         oldest=np.empty((SIZE, SIZE)),
         auxiliary=np.zeros((count, 3, 3)),
+        across=np.zeros((count, len(COLUMNS), len(COLUMNS)), np.float32) if across else None,
     )
     drawn, later = np.empty((count, *_DRAWN[0].shape)), None
     # A state's row, or the error against the path.
@@ -143,16 +141,18 @@ def smoothed(steps: Trail, about: Path | None = None, *, auxiliary: bool = False
             here, P = step.after, step.covariance
         else:
             P_before = predicted(step.covariance, later.F, later.Q, later.walk)
-            across = step.covariance.copy()
-            across[:, :MOVING] = step.covariance @ later.F.T
+            moved_on = step.covariance.copy()
+            moved_on[:, :MOVING] = step.covariance @ later.F.T
             error = State(here).minus(State(later.before)) if about is None else here - later.before
-            solved = np.linalg.solve(P_before, np.hstack((across.T, _FREE)) if auxiliary else across.T).T
+            solved = np.linalg.solve(P_before, np.hstack((moved_on.T, _FREE)) if auxiliary else moved_on.T).T
             gain, by_free = solved[:SIZE], solved[SIZE:]
             if auxiliary:
                 squares, expected = (by_free @ error) ** 2, ((by_free @ (P_before - P)) * by_free).sum(axis=1)
                 path.auxiliary[k + 1] = np.stack((squares, expected, _walked(later))).reshape(3, 3, 3).sum(axis=2).T
             moved = gain @ error
             here = State(step.after).plus(moved).row if about is None else step.after + moved
+            if path.across is not None:
+                path.across[k + 1] = (gain[COLUMNS] @ P)[:, COLUMNS]
             P = step.covariance + gain @ (P - P_before) @ gain.T
             P = 0.5 * (P + P.T)
         path.t_s[k], path.light_s[k], path.lights[k] = step.t_s, step.light_s, step.lights
@@ -173,51 +173,6 @@ def smoothed(steps: Trail, about: Path | None = None, *, auxiliary: bool = False
     return path
 
 
-def rows_between(path: Path, times_s: Floats, stamps_ns: Sequence[int]) -> Iterator[TrackRow]:
-    """Yield the smoothed steps' rows at times (N,) within them, by Hermite interpolation."""
-    if len(path) < 2:
-        return
-    within = np.flatnonzero((times_s >= path.t_s[0] - 1e-3) & (times_s <= path.t_s[-1] + 1e-3))
-    for start in range(0, len(within), TOGETHER):
-        some = within[start : start + TOGETHER]
-        with np.errstate(all="ignore"):
-            rows = _rows_together(path, times_s[some], [stamps_ns[i] for i in some.tolist()])
-        yield from (row for row in rows if row is not None)
-
-
-def _rows_together(path: Path, times_s: Floats, stamps_ns: Sequence[int]) -> list[TrackRow | None]:
-    one = np.clip(np.searchsorted(path.t_s, times_s, side="right") - 1, 0, len(path) - 2)
-    two = one + 1
-    span = np.maximum(path.t_s[two] - path.t_s[one], 1e-6)
-    a = (times_s - path.t_s[one]) / span
-    # Cubic Hermite polynomials: of the end point, and of the slopes at both ends.
-    end, slope0, slope1 = a * a * (3.0 - 2.0 * a), span * a * (1.0 - a) ** 2, span * a * a * (a - 1.0)
-    before, after = State(path.states[one]), State(path.states[two])
-    r = before.r_m + end[:, None] * (after.r_m - before.r_m)
-    r += slope0[:, None] * before.v_mps + slope1[:, None] * after.v_mps
-    v = before.v_mps + a[:, None] * (after.v_mps - before.v_mps)
-    turn = rotation_log(np.swapaxes(before.R, -1, -2) @ after.R)
-    # The first step has no turn rates of its own.
-    first = (one == 0)[:, None, None]
-    mean_rate = turn / span[:, None, None]
-    rates = [np.where(first, mean_rate, path.rates_radps[k]) for k in (one, two)]
-    R = before.R @ rotation_exp(
-        end[:, None, None] * turn + slope0[:, None, None] * rates[0] + slope1[:, None, None] * rates[1]
-    )
-    b = np.clip(a, 0.0, 1.0)
-    b3 = b[:, None, None]
-    near = np.where(b < 1.0, one, two)
-    between = before.moved(r, v, R)
-    return rows_of(
-        stamps_ns,
-        between,
-        (1.0 - b3) * path.covariance(one) + b3 * path.covariance(two) + _unseen(path, between, two, span, b),
-        (1.0 - b3) * path.rates_radps[one] + b3 * path.rates_radps[two],
-        path.lights[near],
-        np.maximum(times_s - path.light_s[near], 0.0),
-    )
-
-
 def _walked(step: Step) -> Floats:
     """Give a third of the variances (9,) that noise added to _FREE in a step: three axes together give their mean."""
     return np.concatenate((step.Q[V_, V_].diagonal(), step.walk[GYRO_BIAS[0].start - MOVING :][:6])) / 3.0
@@ -230,30 +185,4 @@ def _drawn(noted: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     moved = np.asarray(noted[..., 2:].any(axis=-1))
     shaken = np.where(moved, of[..., 1], 0.0)
     without = np.asarray(~moved[:, :2] & (of[:, :2, 0] > 0.0))
-    return np.concatenate((shaken[:, :2], of[:, :2, 0] - shaken[:, :2], shaken[:, 2:]), axis=1), without
-
-
-def _unseen(path: Path, states: State, two: NDArray[np.intp], span_s: Floats, share: Floats) -> Floats:
-    """Give what states between two steps may be off by, whatever is known at both, (M, C, C) of COLUMNS.
-
-    share (M,): of the span that has passed since the first. Of what noise does in a step h, white noise leaves
-    s (h - s) / h^2, a walk of the turn rate the cube of that, and shaking
-    (1 - e^(-2 s / t)) (1 - e^(-2 (h - s) / t)) / (1 - e^(-2 h / t))^2, but no more than what the interpolation takes
-    from the rates at both ends, which are shaken too.
-    """
-    gone = [-np.expm1(-2.0 * passed * span_s / SHAKEN_S) for passed in (share, 1.0 - share, np.ones_like(share))]
-    shaken = path.drawn[two] * (gone[0] * gone[1] / gone[2] ** 2)[:, None]
-    left = (share * (1.0 - share))[:, None]
-    white = path.drawn[two, 2:4] * np.where(path.without[two], left**3, left)
-    slopes = span_s**2 * ((share * (1.0 - share) ** 2) ** 2 + (share**2 * (1.0 - share)) ** 2)
-    most = slopes[:, None] * path.swings[two]
-    variances = np.zeros((len(two), NAV))
-    variances[:, PHI[0]] = (np.minimum(shaken[:, 0], most[:, 0]) + white[:, 0])[:, None]
-    variances[:, PHI[1]] = (np.minimum(shaken[:, 1], most[:, 1]) + white[:, 1])[:, None]
-    variances[:, V_] = shaken[:, 4:5]
-    T = np.zeros((len(two), NAV, NAV))
-    T[:] = np.eye(NAV)
-    T[:, R_, PHI[1]], T[:, V_, PHI[0]] = skew(states.r_m), skew(states.v_mps)
-    out = np.zeros((len(two), len(COLUMNS), len(COLUMNS)))
-    out[:, :NAV, :NAV] = (T * variances[:, None, :]) @ np.swapaxes(T, -1, -2)
-    return out
+    return np.concatenate((shaken, of[..., 0] - shaken), axis=1), without

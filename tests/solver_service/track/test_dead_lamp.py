@@ -10,11 +10,12 @@ from buddyline.node.sim.world import World
 from buddyline.protocol.messages import LightTruth, NodePose, Track, TrackMode, Truth
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.trigger import Settings
+from buddyline.solver_service.track.between import rows_between
 from buddyline.solver_service.track.dive import smooth
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.records import last_ns
-from buddyline.solver_service.track.smoother import rows_between, smoothed
+from buddyline.solver_service.track.smoother import smoothed
 from buddyline.solver_service.track.start import constants_of
 from buddyline.solver_service.tracking import TrackSettings
 

@@ -222,9 +222,9 @@ def test_seconds_of_darkness(dark_s: float, worst_m: float) -> None:
 def test_passes_that_diverge_are_no_track(monkeypatch: pytest.MonkeyPatch) -> None:
     short = make(4, replace(SHORT, seconds=6.0))
 
-    def diverging(steps: Trail, about: Path, *, auxiliary: bool) -> Path:
+    def diverging(steps: Trail, about: Path, **asked: bool) -> Path:
         """Its clocks are 0.7 s apart."""
-        path = smoothed(steps, about, auxiliary=auxiliary)
+        path = smoothed(steps, about, **asked)
         return replace(path, states=np.array([path.state(k).with_parts(clock_s=-0.7).row for k in range(len(path))]))
 
     assert list(smooth(short.records, short.fixes, short.stamps_ns).rows)
