@@ -15,7 +15,6 @@ from buddyline.solver_service.track.smoother import Path
 from buddyline.solver_service.track.state import NAV, PHI, R_, V_, State, invariant_of_plain, plain_of_invariant
 from numpy.typing import NDArray
 
-_TURNED: Final = np.r_[PHI[0], PHI[1]]
 # So many rows are made at once.
 TOGETHER: Final = 256
 
@@ -71,8 +70,8 @@ class Weights:
     """How states between two steps are made of both: velocities go straight, the others by Hermite's cubics, each (M,).
 
     share: of the span that has passed. end: of the end point, by which place and turn go from one step to the next;
-    slopes (2, M), s: of the velocities at both. turned, rated (2, M): the same of the attitude, where the first turn
-    rates may be unknown: they are those of the whole turn then.
+    slopes (2, M), s: of the velocities at both. turned (M,), rated (2, M): the same of the attitude, where the first
+    turn rates may be unknown: they are those of the whole turn then.
     """
 
     share: Floats
@@ -102,18 +101,18 @@ class Weights:
     def jacobians(self, before: State, after: State, between: State) -> tuple[Floats, Floats]:
         """Give the errors of COLUMNS of the states between by those before and after, (M, C, C) each.
 
-        Plain errors of place and velocity add up by the weights, and so do those of attitudes, but for the turn's own
-        size. (What turn rates err by is in `_unseen`, or too little.) The state's own errors are a screw's
-        (`State.plus`), so T takes them to plain ones at both steps, and back between.
+        Where nodes have units: their samples tell how they turn between two steps. So attitudes' errors go straight
+        from one step's to the other's, however the turn goes, but for what white noise does (`_unseen`). Plain errors
+        of places and velocities add up by the weights. The state's own errors are a screw's (`State.plus`), so T takes
+        them to plain ones at both steps, and back between.
         """
         back = invariant_of_plain(between)[:, :NAV, :NAV]
         both = []
         for k, state in enumerate((before, after)):
-            of_place, of_turn, of_share = (w if k else 1.0 - w for w in (self.end, self.turned, self.share))
+            of_place, of_share = (w if k else 1.0 - w for w in (self.end, self.share))
             J = of_share[:, None, None] * np.eye(len(COLUMNS))
             J[:, range(3), range(3)] = of_place[:, None]
             J[:, range(3), range(3, 6)] = self.slopes[k, :, None]
-            J[:, _TURNED, _TURNED] = of_turn[:, None]
             J[:, :, :NAV] = J[:, :, :NAV] @ plain_of_invariant(state)[:, :NAV, :NAV]
             J[:, :NAV] = back @ J[:, :NAV]
             both.append(J)
