@@ -39,13 +39,13 @@ from buddyline.solver_service.track.dive import smooth
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.forecasts import DueRow, Forecast, make_rows, work_out
 from buddyline.solver_service.track.foresight import ForeseenLight, Foresight, foresee
-from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, TrackNode
+from buddyline.solver_service.track.inputs import Attitudes, DepthSeen, FixSeen, FrameSeen, TrackNode
 from buddyline.solver_service.track.lag import EVERY_S, KEPT_S, TrackLag
 from buddyline.solver_service.track.lamps import UNSEEN_PICTURES, UNSEEN_S
 from buddyline.solver_service.track.moving import HOLD_S
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.problems import ENDED_S, as_ended
-from buddyline.solver_service.track.records import NodeRecord, feed, joined
+from buddyline.solver_service.track.records import NodeRecord, Records, feed, joined
 from msgspec import UNSET, structs
 
 # For how long after its stamp an expectation serves: its sigma has grown to a large part of the picture by then.
@@ -205,6 +205,8 @@ class PairTracker:
         with np.errstate(all="ignore"):
             try:
                 self._advance(self._settled_ns + S_NS)
+                if not all(self._pieces):
+                    return None
                 a, b = map(joined, self._pieces)
                 return clocks_of((a, b), self._fixes)
             except NUMERIC_ERRORS as error:
@@ -301,6 +303,7 @@ class PairTracker:
         """Take what is left, and return what the end of the dive tells: the rest of the live tracks, the smooth one.
 
         The smooth track's messages are made as they are read, for they take more memory than all they are made from.
+        It is told once: a later call tells what came since.
         """
         # Later rows would only be guessed. The filter holds back what is within HOLD_S of the end.
         heard_ns = max(stream.heard_ns for stream in self._streams) + round(2.0 * HOLD_S * S_NS)
@@ -315,10 +318,9 @@ class PairTracker:
                 messages = self._told(self._advance(end_ns))
                 if self._lag is not None:
                     messages += self._messages(self._lag.finish(), "lag")
-                if "smooth" not in self._settings.modes:
+                if not all(self._pieces):
                     return messages
-                a, b = map(joined, self._pieces)
-                found = smooth((a, b), self._fixes, self._due(self._first_ns or 0, end_ns))
+                found = smooth(self._recorded(), self._fixes, self._due(self._first_ns or 0, end_ns))
             except NUMERIC_ERRORS as error:
                 self._start_anew(str(error))
                 return []
@@ -334,6 +336,11 @@ class PairTracker:
         if live:
             self._filter = TrackFilter(*nodes, keep_s=KEPT_S if "lag" in live else 0.0)
             self._lag = TrackLag(self._filter) if "lag" in live else None
+
+    def _recorded(self) -> Records:
+        """Give what both nodes recorded, once: the pieces, which take as much memory again, are let go of."""
+        pieces, self._pieces = self._pieces, ([], [])
+        return joined(pieces[0]), joined(pieces[1])
 
     def _frontier_ns(self) -> int:
         """Return up to when everything has come: outcomes, and the samples of the sensors that have not stopped."""
@@ -504,16 +511,13 @@ def frame_of(view: View) -> FrameSeen:
     return FrameSeen(view.stamp_ns, view.pixels, view.sigma_px, dt_ns, view.elsewhere)
 
 
-def attitudes_of(messages: Sequence[Attitude], first: Rig, own: Rig) -> list[AttitudeSeen]:
+def attitudes_of(messages: Sequence[Attitude], first: Rig, own: Rig) -> Attitudes:
     """Return a node's attitudes from the north of the first node's, which may have another declination."""
-    if not messages:
-        return []
-    R = quat_to_matrix(np.array([message.q_ned_body_xyzw for message in messages]))
+    R = quat_to_matrix(np.array([message.q_ned_body_xyzw for message in messages]).reshape(-1, 4))
     if first.declination_rad != own.declination_rad:
         R = rotation_exp(np.array([0.0, 0.0, first.declination_rad - own.declination_rad])) @ R
-    sigmas_rad = np.array([message.sigma_rad for message in messages])
-    stamps_ns = [message.stamp_ns for message in messages]
-    return list(map(AttitudeSeen, stamps_ns, R, sigmas_rad))
+    sigmas_rad = np.array([message.sigma_rad for message in messages]).reshape(-1, 3)
+    return Attitudes(np.array([message.stamp_ns for message in messages], dtype=np.int64), R, sigmas_rad)
 
 
 def fix_of(pose: RelativePose) -> FixSeen:

@@ -45,7 +45,6 @@ from buddyline.solver_service.track.records import (
 from buddyline.solver_service.track.relax import PassedOver, PathPass, clock_sigma_s, settled
 from buddyline.solver_service.track.smoother import Path, smoothed
 from buddyline.solver_service.track.start import CLOCK_S
-from buddyline.solver_service.track.trail import Trail
 from buddyline.solver_service.track.vibration import Shares
 from buddyline.solver_service.track.walking import Walking, joint
 
@@ -133,9 +132,7 @@ def smooth(
     lost: list[str] = []
     since_s, contradicting_ns = -math.inf, None
     for part in parts:
-        path, shaking = smoothed(part.steps), part.shaking.less(shares)
-        # Every step of the first pass holds a covariance: both passes at once take twice the memory.
-        part.steps = Trail()
+        path, shaking = smoothed(part.steps, uses_up=True), part.shaking.less(shares)
         earlier = _path_before(known, path, since_s)
         since_s = part.end_s
         # Where the dive's beginning, before the first start, leads the passes astray, it is left out.
@@ -172,8 +169,7 @@ def _clock_s(track: TrackFilter | PathPass, path: Path) -> float:
 
 def _of_one_lamp_each(known: PassedOver, part: Estimate, outputs_ns: Sequence[int]) -> Smoothed:
     """Give the track that began with one lamp of each node, the dive's beginning with it if that settles, too."""
-    path, told, shaking = smoothed(part.steps), sum(part.told_by), part.shaking.less(known.shares)
-    part.steps = Trail()
+    path, told, shaking = smoothed(part.steps, uses_up=True), sum(part.told_by), part.shaking.less(known.shares)
     # A reflection beside the lit lamp would pass for the dark one, and tell a range.
     lit = np.where(part.detection < NEVER_FOUND, 0.0, part.detection)
     found = settled(path, lit, shaking, known, told, doubtful=True)
@@ -255,9 +251,7 @@ def _of_guessed_motion(
     """
     found: list[tuple[TrackFilter | PathPass, Path]] = []
     for part in parts_of(first):
-        path, guessed = smoothed(part.steps, auxiliary=True), GuessedMotion.of(part.walking)
-        # Every step of the first pass holds a covariance: both passes at once take twice the memory.
-        part.steps = Trail()
+        path, guessed = smoothed(part.steps, auxiliary=True, uses_up=True), GuessedMotion.of(part.walking)
         known = PassedOver(
             records,
             first.epoch_ns or 0,

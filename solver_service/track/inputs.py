@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import overload
 
 import numpy as np
 from buddyline.solver_service.geometry.rig import Rig
@@ -58,6 +60,61 @@ class AttitudeSeen:
     stamp_ns: int
     R_ned_body: Floats
     sigma_rad: Floats
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Attitudes(Sequence[AttitudeSeen]):
+    """Attitude messages as columns: stamps (N,), R_ned_body (N, 3, 3), sigma_rad (N, 3). An hour may have 360,000.
+
+    As objects, each made of three more, they would take four times the memory.
+    """
+
+    stamps_ns: Stamps
+    R_ned_body: Floats
+    sigma_rad: Floats
+
+    @classmethod
+    def joined(cls, pieces: Sequence[Sequence[AttitudeSeen]]) -> Attitudes:
+        """Give those of pieces, at least one, in order of stamps."""
+        every = [piece if isinstance(piece, Attitudes) else cls._of(piece) for piece in pieces]
+        if len(every) == 1 and bool((np.diff(every[0].stamps_ns) >= 0).all()):
+            return every[0]
+        together = cls(
+            *(
+                np.concatenate([getattr(one, name) for one in every])
+                for name in ("stamps_ns", "R_ned_body", "sigma_rad")
+            )
+        )
+        return together._chosen(np.argsort(together.stamps_ns, kind="stable"))
+
+    @classmethod
+    def _of(cls, seen: Sequence[AttitudeSeen]) -> Attitudes:
+        stamps_ns = np.array([one.stamp_ns for one in seen], dtype=np.int64)
+        R = np.array([one.R_ned_body for one in seen]).reshape(-1, 3, 3)
+        return cls(stamps_ns, R, np.array([one.sigma_rad for one in seen]).reshape(-1, 3))
+
+    def _chosen(self, rows: slice | NDArray[np.intp]) -> Attitudes:
+        return Attitudes(self.stamps_ns[rows], self.R_ned_body[rows], self.sigma_rad[rows])
+
+    def __len__(self) -> int:
+        """Return the number of messages."""
+        return len(self.stamps_ns)
+
+    @overload
+    def __getitem__(self, at: int) -> AttitudeSeen: ...
+
+    @overload
+    def __getitem__(self, at: slice) -> Attitudes: ...
+
+    def __getitem__(self, at: int | slice) -> AttitudeSeen | Attitudes:
+        """Give one message, or those of a slice."""
+        if isinstance(at, slice):
+            return self._chosen(at)
+        return AttitudeSeen(int(self.stamps_ns[at]), self.R_ned_body[at], self.sigma_rad[at])
+
+    def __iter__(self) -> Iterator[AttitudeSeen]:
+        """Yield each message."""
+        return map(AttitudeSeen, self.stamps_ns.tolist(), self.R_ned_body, self.sigma_rad)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

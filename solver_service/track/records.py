@@ -10,7 +10,15 @@ from typing import Final, TypeAlias, TypeVar
 import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.solver_service.geometry.rotation import Floats
-from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, Stamps, TrackNode
+from buddyline.solver_service.track.inputs import (
+    Attitudes,
+    AttitudeSeen,
+    DepthSeen,
+    FixSeen,
+    FrameSeen,
+    Stamps,
+    TrackNode,
+)
 from buddyline.solver_service.track.intake import TrackIntake
 from buddyline.solver_service.track.stepping import TrackSteps
 from buddyline.solver_service.track.vibration import fast_part, sudden_turn
@@ -74,7 +82,7 @@ def joined(pieces: Sequence[NodeRecord]) -> NodeRecord:
         imu_stamps_ns=np.concatenate([piece.imu_stamps_ns for piece in pieces]),
         accel_mps2=np.concatenate([piece.accel_mps2 for piece in pieces]),
         gyro_radps=np.concatenate([piece.gyro_radps for piece in pieces]),
-        attitudes=[each for piece in pieces for each in piece.attitudes],
+        attitudes=Attitudes.joined([piece.attitudes for piece in pieces]),
         depths=[each for piece in pieces for each in piece.depths],
     )
 
@@ -88,7 +96,7 @@ def in_order(record: NodeRecord) -> NodeRecord:
         imu_stamps_ns=record.imu_stamps_ns[order],
         accel_mps2=record.accel_mps2[order],
         gyro_radps=record.gyro_radps[order],
-        attitudes=sorted(record.attitudes, key=stamp_of),
+        attitudes=Attitudes.joined([record.attitudes]),
         depths=sorted(record.depths, key=stamp_of),
     )
 

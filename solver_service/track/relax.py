@@ -53,7 +53,7 @@ from buddyline.solver_service.track.strapdown import (
     propagate,
     sampled,
 )
-from buddyline.solver_service.track.trail import Look, Step, Trail
+from buddyline.solver_service.track.trail import Look, Step
 from buddyline.solver_service.track.walking import Walking
 from numpy.typing import NDArray
 
@@ -332,20 +332,18 @@ def settled(
     for count in range(1, PASSES + 1):
         if known.guessed is not None:
             known = replace(known, guessed=known.guessed.relearned(path))
+        # That is for rows alone.
+        path = replace(path, across=None)
         track = PathPass(known, path, detection, shaking, keeps=guesses and count == 1)
         pass_over(track, records, ())
         passed = track.passed
-        old, path, detection = (
-            path,
-            smoothed(passed.steps, path, auxiliary=guesses, across=not guesses),
-            passed.detection,
-        )
-        # Every step holds a covariance: those of two passes take twice the memory.
-        passed.steps = Trail()
+        about, detection = path, passed.detection
+        path = smoothed(passed.steps, about, auxiliary=guesses, across=not guesses, uses_up=True)
         if not bool(np.isfinite(path.states).all()):
             return None
         learned = not guesses or count >= GUESSING_PASSES
-        stays = learned and _stays(old, path, DOUBTFUL_SIGMAS if doubtful else STAYS_SIGMAS)
+        stays = learned and _stays(about, path, DOUBTFUL_SIGMAS if doubtful else STAYS_SIGMAS)
+        del about  # The next pass needs the memory.
         if stays and _contradicted(path, known.fixes) <= contradicted:
             left_s = path.state(-1).clock_s
             # What a doubtful track, or one without a gyro, tells of the clocks is little, and less than it believes.

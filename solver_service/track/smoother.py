@@ -66,7 +66,7 @@ class Path:
     looks: Sequence[tuple[Look, ...]]
     oldest: Floats
     auxiliary: Floats
-    across: NDArray[np.float32] | None = None
+    across: Floats | None = None
 
     def __len__(self) -> int:
         """Return the number of steps."""
@@ -107,14 +107,21 @@ class Path:
         return P
 
 
-def smoothed(steps: Trail, about: Path | None = None, *, auxiliary: bool = False, across: bool = False) -> Path:
+def smoothed(
+    steps: Trail,
+    about: Path | None = None,
+    *,
+    auxiliary: bool = False,
+    across: bool = False,
+    uses_up: bool = False,
+) -> Path:
     """Give the state and covariance of each step by all steps' measurements.
 
     Backward, C = P F^T (P-)^-1 with P- = F P F^T + Q; the state is off its filtered one by C (x+1 - x-), its covariance
     P + C (P+1 - P-) C^T. about: the path that these steps are linear about: errors are then taken against it, where
     they add up exactly. auxiliary: whether to give auxiliary residuals (Harvey and Koopman 1992),
     s = (P-)^-1 (x+1 - x-): the noise was off by Q s. The covariance of s is (P-)^-1 (P- - P+1) (P-)^-1. across: whether
-    to give the covariances of neighbours, C P+1 (de Jong and MacKinnon 1988).
+    to give the covariances of neighbours, C P+1 (de Jong and MacKinnon 1988). uses_up: whether the steps are let go of.
     """
     count = len(steps)
     looks: list[tuple[Look, ...]] = [()] * count
@@ -131,12 +138,12 @@ def smoothed(steps: Trail, about: Path | None = None, *, auxiliary: bool = False
         looks=looks,
         oldest=np.empty((SIZE, SIZE)),
         auxiliary=np.zeros((count, 3, 3)),
-        across=np.zeros((count, len(COLUMNS), len(COLUMNS)), np.float32) if across else None,
+        across=np.zeros((count, len(COLUMNS), len(COLUMNS))) if across else None,
     )
     drawn, later = np.empty((count, *_DRAWN[0].shape)), None
     # A state's row, or the error against the path.
     here = np.zeros(0)
-    for k, step in zip(range(count - 1, -1, -1), steps.backward(), strict=True):
+    for k, step in zip(range(count - 1, -1, -1), steps.used_up() if uses_up else steps.backward(), strict=True):
         if later is None:
             here, P = step.after, step.covariance
         else:

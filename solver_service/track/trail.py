@@ -151,3 +151,10 @@ class Trail:
         yield from reversed(self._new)
         for pack in reversed(self._packs):
             yield from reversed(pack.steps())
+
+    def used_up(self) -> Iterator[Step]:
+        """Yield the steps, the newest first, and let go of them: of a long dive they take more memory than all else."""
+        while self._new:
+            yield self._new.pop()
+        while self._packs:
+            yield from reversed(self._packs.pop().steps())

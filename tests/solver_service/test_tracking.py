@@ -153,6 +153,13 @@ def test_a_track_begins_with_the_first_pose_however_many_messages_come_at_once()
         assert np.abs(np.subtract(one.t_a_b_m, other.t_a_b_m)).max() < 1e-4 * sigma_m.min()
 
 
+def test_a_smoothed_track_is_told_once(five_seconds):
+    tracks, solver = tracks_of(five_seconds[0], "smooth")
+    assert len(tracks) > 80
+    assert not [one for one in solver.flush() if isinstance(one, Track)]
+    assert solver.pairs["a", "b"].tracker.clocks() is None
+
+
 def test_each_mode_is_better_than_the_one_before_it_and_says_how_good_it_is(inertial_dive, filtered):
     messages, world = inertial_dive
     medians_m = []

@@ -42,6 +42,12 @@ def test_packed_steps_come_back() -> None:
     assert np.allclose(one.states, two.states, rtol=0.0, atol=1e-9)
     assert np.allclose(one.halves, two.halves, rtol=1e-6, atol=1e-12)
 
+    copy = packed.copy()
+    three = smoothed(copy, uses_up=True)
+    assert np.array_equal(three.states, two.states)
+    assert np.array_equal(three.halves, two.halves)
+    assert (len(copy), len(packed)) == (0, len(plain))
+
     middle_s = plain[PACK // 2].t_s
     copy = packed.copy()
     copy.drop_after(middle_s)
