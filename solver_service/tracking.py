@@ -303,7 +303,7 @@ class PairTracker:
         """Take what is left, and return what the end of the dive tells: the rest of the live tracks, the smooth one.
 
         The smooth track's messages are made as they are read, for they take more memory than all they are made from.
-        It is told once: a later call tells what came since.
+        The smooth track is told once: a later call tells only what came since.
         """
         # Later rows would only be guessed. The filter holds back what is within HOLD_S of the end.
         heard_ns = max(stream.heard_ns for stream in self._streams) + round(2.0 * HOLD_S * S_NS)

@@ -69,9 +69,9 @@ def _mixed(share: Floats, one: Floats, two: Floats) -> Floats:
 class Weights:
     """How states between two steps are made of both: velocities go straight, the others by Hermite's cubics, each (M,).
 
-    share: of the span that has passed. end: of the end point, by which place and turn go from one step to the next;
-    slopes (2, M), s: of the velocities at both. turned (M,), rated (2, M): the same of the attitude, where the first
-    turn rates may be unknown: they are those of the whole turn then.
+    share: of the span that has passed. end: how much of the way from the first place to the second counts; slopes
+    (2, M), s: how much both velocities do. turned (M,), rated (2, M): the same of the attitude. Where the first turn
+    rates are unknown, they are taken to be those of the whole turn.
     """
 
     share: Floats
@@ -101,10 +101,10 @@ class Weights:
     def jacobians(self, before: State, after: State, between: State) -> tuple[Floats, Floats]:
         """Give the errors of COLUMNS of the states between by those before and after, (M, C, C) each.
 
-        Where nodes have units: their samples tell how they turn between two steps. So attitudes' errors go straight
-        from one step's to the other's, however the turn goes, but for what white noise does (`_unseen`). Plain errors
-        of places and velocities add up by the weights. The state's own errors are a screw's (`State.plus`), so T takes
-        them to plain ones at both steps, and back between.
+        This is of nodes with units, whose samples tell how they turn between two steps. So errors of attitudes go
+        straight from those of one step to those of the other, whatever the turn. (What white noise does is in
+        `_unseen`.) Plain errors of places and velocities add up by the weights. The state's own errors are a screw's
+        (`State.plus`): T makes plain ones of them at both steps, and its inverse brings them back between.
         """
         back = invariant_of_plain(between)[:, :NAV, :NAV]
         both = []
@@ -122,10 +122,10 @@ class Weights:
 def _unseen(path: Path, states: State, two: NDArray[np.intp], span_s: Floats, weights: Weights) -> Floats:
     """Give what states between two steps may be off by, whatever is known at both, (M, C, C) of COLUMNS.
 
-    Of what noise does in a step h, after the share s / h of it, white noise leaves a = s (h - s) / h^2, a walk of the
-    turn rate a^3, one of the velocity a of it, which is interpolated by itself, and h^2 a^3 / 3 of the place, and
-    shaking (1 - e^(-2 s / t)) (1 - e^(-2 (h - s) / t)) / (1 - e^(-2 h / t))^2, but no more than what the interpolation
-    takes from the rates at both ends, which are shaken too.
+    Of the variance that noise adds in a step h this is left after s of it, with a = s (h - s) / h^2. White noise: a. A
+    walk of the turn rate: a^3 of the turn. A walk of the velocity: a of the velocity, and h^2 a^3 / 3 of that for the
+    place. Shaking: (1 - e^(-2 s / t)) (1 - e^(-2 (h - s) / t)) / (1 - e^(-2 h / t))^2, but no more than what the
+    interpolation takes from the rates at both ends, which are shaken too.
     """
     share = np.clip(weights.share, 0.0, 1.0)
     gone = [-np.expm1(-2.0 * passed * span_s / SHAKEN_S) for passed in (share, 1.0 - share, np.ones_like(share))]

@@ -64,9 +64,9 @@ class AttitudeSeen:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Attitudes(Sequence[AttitudeSeen]):
-    """Attitude messages as columns: stamps (N,), R_ned_body (N, 3, 3), sigma_rad (N, 3). An hour may have 360,000.
+    """Attitude messages as columns: stamps (N,), R_ned_body (N, 3, 3), sigma_rad (N, 3).
 
-    As objects, each made of three more, they would take four times the memory.
+    An hour may have 360,000 of a node. As a list of AttitudeSeen they would take four times the memory.
     """
 
     stamps_ns: Stamps

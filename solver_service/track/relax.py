@@ -332,7 +332,7 @@ def settled(
     for count in range(1, PASSES + 1):
         if known.guessed is not None:
             known = replace(known, guessed=known.guessed.relearned(path))
-        # That is for rows alone.
+        # Only the last pass's rows need this.
         path = replace(path, across=None)
         track = PathPass(known, path, detection, shaking, keeps=guesses and count == 1)
         pass_over(track, records, ())

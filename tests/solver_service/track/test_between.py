@@ -19,7 +19,7 @@ from tests.solver_service.track.dives import EPOCH_NS, Setting, filter_of, make
 
 STEP = 1e-6
 SPAN_S = 0.1
-# In SPAN_S, with turns of up to 0.01 rad: a turn's own size is not in the Jacobians.
+# In SPAN_S nodes turn by up to 0.01 rad, which the Jacobians leave out.
 SMALL = 5e-3
 
 
