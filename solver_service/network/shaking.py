@@ -72,13 +72,20 @@ class NetShaking:
         return NetShaking(self.logs, self.information, onward @ self.parts @ np.swapaxes(onward, -1, -2) + drawn)
 
     def taught(self, y: Floats, S_inverse: Floats, H: Floats, P: Floats) -> NetShaking:
-        """Go on by one picture's residuals y (m,), H (m, N), P (N, N), by Fisher's scoring (Shaking.taught)."""
+        """Go on by one picture's residuals y (m,), H (m, N), P (N, N), by Fisher's scoring (Shaking.taught).
+
+        A node's part does not follow what an update makes of it in other nodes' errors. Between nodes whose places are
+        poorly known, but together, it could grow without an end: it is kept within all of S, tr(S^-1 D) <= m.
+        """
         n, m = len(self.logs), len(y)
         H_own = np.swapaxes(H[:, 1:].reshape(m, n, -1), 0, 1)[:, :, :MOVING]
         D = (H_own[:, None] @ self.parts @ np.swapaxes(H_own, 1, 2)[:, None]).reshape(2 * n, m, m)
+        W = S_inverse @ D
+        share = np.trace(W, axis1=1, axis2=2) * self.variances.ravel() / m
+        above = np.maximum(share, 1.0)[:, None, None]
+        D, W, own = D / above, W / above, self.parts / above.reshape(n, 2, 1, 1)
         z = S_inverse @ y
         z = z * math.sqrt(min(1.0, MOST_CHI2 * m / max(float(y @ z), 1e-9)))
-        W = S_inverse @ D
         slope = 0.5 * (D @ z @ z - np.trace(W, axis1=1, axis2=2))
         fisher = 0.5 * (W.reshape(2 * n, -1) @ np.swapaxes(W, 1, 2).reshape(2 * n, -1).T)
         kept = 0.5 ** (1.0 / (HALVED * n))
@@ -86,7 +93,7 @@ class NetShaking:
         step = np.clip(np.linalg.solve(information, slope), -LONGEST_STEP, LONGEST_STEP).reshape(n, 2)
         gain = (P @ H.T @ S_inverse)[1:].reshape(n, -1, m)[:, :MOVING]
         rest = (np.eye(MOVING) - gain @ H_own)[:, None]
-        parts = rest @ self.parts @ np.swapaxes(rest, -1, -2)
+        parts = rest @ own @ np.swapaxes(rest, -1, -2)
         return NetShaking(np.clip(self.logs + step, *_BOUNDS), information, parts)
 
 
