@@ -6,6 +6,7 @@ import statistics
 from collections import deque
 
 from buddyline.node.detect import Detection, Detector, GuidedDetector
+from buddyline.node.detect.detection import CLIPPED, LASTING_S
 from buddyline.node.devices import Frame
 from buddyline.node.guide import Guide, expected_first
 from buddyline.protocol.clock import trigger_index
@@ -28,7 +29,7 @@ def blobs_of(detections: list[Detection], frame: Frame) -> tuple[list[Blob], int
 
 
 def _rounded(blob: Blob, dt_ns: int) -> Blob:
-    """Return a blob without digits far below its errors: they would be half of the message, on a slow link as well."""
+    """Return a blob as it is sent, without digits far below its errors, which would be half of the message."""
     return Blob(
         u_px=round(blob.u_px, 4),
         v_px=round(blob.v_px, 4),
@@ -38,6 +39,7 @@ def _rounded(blob: Blob, dt_ns: int) -> Blob:
         elongation=round(blob.elongation, 3),
         dt_ns=dt_ns,
         score=UNSET if blob.score is UNSET else round(blob.score, 4),
+        lasting_s=LASTING_S if blob.peak >= CLIPPED else UNSET,
     )
 
 

@@ -56,11 +56,12 @@ def view_of(frame: Candidates) -> View:
             math.nan if blob.score is UNSET else blob.score,
             blob.area_px,
             1e-9 * blob.dt_ns,
+            0.0 if blob.lasting_s is UNSET else blob.lasting_s,
         )
         for blob in frame.blobs
     ]
     elsewhere = 0 if frame.elsewhere is UNSET else frame.elsewhere
-    return View(np.array(rows, dtype=np.float64).reshape(-1, 6), frame.stamp_ns, elsewhere)
+    return View(np.array(rows, dtype=np.float64).reshape(-1, 7), frame.stamp_ns, elsewhere)
 
 
 def _cut_px(blob: Blob, frame: Candidates) -> float:

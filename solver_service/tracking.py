@@ -508,7 +508,7 @@ def same_rig(info: NodeInfo, other: NodeInfo) -> bool:
 def frame_of(view: View) -> FrameSeen:
     """Return a frame as the track and the network take it."""
     dt_ns = np.rint(view.dt_s * S_NS).astype(np.int64)
-    return FrameSeen(view.stamp_ns, view.pixels, view.sigma_px, dt_ns, view.elsewhere)
+    return FrameSeen(view.stamp_ns, view.pixels, view.sigma_px, dt_ns, view.elsewhere, view.lasting_s)
 
 
 def attitudes_of(messages: Sequence[Attitude], first: Rig, own: Rig) -> Attitudes:

@@ -56,8 +56,8 @@ class View:
 
     @staticmethod
     def of(pixels: Floats, sigma_px: Floats, score: Floats, area_px: Floats, dt_s: Floats, stamp_ns: int) -> View:
-        """Put the columns together: pixels (N, 2), all others (N,)."""
-        return View(np.column_stack((pixels, sigma_px, score, area_px, dt_s)), stamp_ns)
+        """Put the columns together: pixels (N, 2), all others (N,); errors are each picture's own."""
+        return View(np.column_stack((pixels, sigma_px, score, area_px, dt_s, np.zeros(len(pixels)))), stamp_ns)
 
     @property
     def pixels(self) -> Floats:
@@ -83,6 +83,11 @@ class View:
     def dt_s(self) -> Floats:
         """Exposure of each one's row after stamp_ns (N,), s."""
         return self.table[:, 5]
+
+    @property
+    def lasting_s(self) -> Floats:
+        """For how long each one's error stays the same (N,), s."""
+        return self.table[:, 6]
 
 
 @dataclass(frozen=True, eq=False)

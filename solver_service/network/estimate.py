@@ -217,8 +217,14 @@ class NetEstimate(NetBelief):
         for bar in (bars[one] for one, *_ in chosen):
             for member in (self.members[bar.other], self.members[bar.observer]):
                 member.light_s = max(member.light_s, bar.sight.t_s)
-        noise = noise_of(variances, H[n, k, light, :, -1], np.array([id(bars[one].sight) for one in n]))
+        counted = variances * [self._alike(bars[one], of) for one, of in zip(n, k, strict=True)]
+        noise = noise_of(counted, H[n, k, light, :, -1], np.array([id(bars[one].sight) for one in n]))
         self._apply(rows.reshape(2 * len(chosen), -1), y[n, k, light].ravel(), noise, teaches=True)
+
+    def _alike(self, bar: Bar, k: int) -> float:
+        """Give how many pictures tell as much as one of a candidate (track/seeing.counted)."""
+        guessed = self.members[bar.observer].without or self.members[bar.other].without
+        return 1.0 if guessed else float(bar.sight.alike[k])
 
     def _judge(self) -> None:
         """Confirm members, and remove those of which no light tells any more."""

@@ -33,7 +33,7 @@ class FrameSeen:
     """The light candidates of one picture.
 
     pixels (K, 2) and sigma_px (K,); dt_ns (K,): each row's exposure minus stamp_ns. elsewhere: how many more the whole
-    picture held, where only parts were searched.
+    picture held, where only parts were searched. lasting_s (K,): for how long each one's error stays the same.
     """
 
     stamp_ns: int
@@ -41,6 +41,7 @@ class FrameSeen:
     sigma_px: Floats
     dt_ns: Stamps = field(default_factory=lambda: np.zeros(0, np.int64))
     elsewhere: int = 0
+    lasting_s: Floats = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False, slots=True)

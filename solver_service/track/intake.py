@@ -26,6 +26,8 @@ SILENT_S: Final = 1.0
 GONE_S: Final = 0.5
 GONE_PICTURES: Final = 3
 LEAST_SIGMA_RAD: Final = 1e-3
+# No camera takes its pictures faster.
+LEAST_APART_S: Final = 1e-3
 # Taken for roll, pitch and yaw where a message states a sigma below LEAST_SIGMA_RAD, which no attitude filter reaches.
 UNTOLD_SIGMA_RAD: Final = np.radians((1.5, 1.5, 6.0))
 # No fix's numbers, in m, rad and their squares, are as large.
@@ -114,13 +116,7 @@ class TrackIntake:
     def add_frame(self, node: int, frame: FrameSeen) -> None:
         """Take a picture's candidates."""
         t_s = self.seconds(node, frame.stamp_ns)
-        dt_s = np.zeros(len(frame.pixels))
-        if len(frame.dt_ns):
-            dt_s += frame.dt_ns * 1e-9
-        sight = sight_of(
-            self.nodes[node].rig, node, frame.stamp_ns, t_s, frame.pixels, frame.sigma_px, dt_s, frame.elsewhere
-        )
-        self._push(t_s, 1 + node, sight)
+        self._push(t_s, 1 + node, sight_of(self.nodes[node].rig, node, t_s, frame))
 
     def add_fix(self, fix: FixSeen) -> None:
         """Take a pose that one trigger's lights gave by themselves; one out of numeric range is left out."""
@@ -166,10 +162,12 @@ class TrackIntake:
                 self._problems.report(said, t_s)
                 self._rejected[node] = samples.rejected
 
-    def _hear(self, node: int, t_s: float) -> None:
-        """Note a node's picture, which has its turn."""
-        before_s, _ = self._pictured_s.get(node, (t_s, 0.0))
-        self._pictured_s[node] = t_s, max(t_s - before_s, 0.0)
+    def _hear(self, sight: Sight, t_s: float) -> Sight:
+        """Note a node's picture, which has its turn; give it with the time since the one before."""
+        before_s, _ = self._pictured_s.get(sight.node, (t_s, 0.0))
+        apart_s = max(t_s - before_s, 0.0)
+        self._pictured_s[sight.node] = t_s, apart_s
+        return replace(sight, apart_s=apart_s) if apart_s > LEAST_APART_S else sight
 
     def between_pictures_s(self, node: int) -> float:
         """Give how long passed between a node's last two pictures, 0 before there are two."""

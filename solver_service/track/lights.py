@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -11,6 +12,7 @@ from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.observation import STAMP_SIGMA_S
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, skew
+from buddyline.solver_service.track.inputs import FrameSeen
 from buddyline.solver_service.track.state import CLOCK, NAV, State
 
 # The errors that move a light in a picture: NAV of them, and the clock's; and their part of a covariance.
@@ -162,7 +164,8 @@ def pixel_of(camera: Camera, X: Floats) -> Floats | None:
 class Sight:
     """One picture as the track uses it: bearings and tangents of its sound candidates.
 
-    t_s: on A's clock as believed; dt_s (K,): of each candidate after it. elsewhere: as in FrameSeen.
+    t_s: on A's clock as believed; dt_s (K,): of each candidate after it. elsewhere, lasting_s (K,): as in FrameSeen.
+    apart_s: time since its node's picture before, inf where there is none.
     """
 
     stamp_ns: int
@@ -172,26 +175,39 @@ class Sight:
     tangents: Floats
     sigma_px: Floats
     dt_s: Floats
+    lasting_s: Floats
     elsewhere: int = 0
+    apart_s: float = math.inf
 
     @property
     def clutter(self) -> float:
         """How many candidates chance may have put into the whole picture: all but one, and never none."""
         return max(len(self.bearings) + self.elsewhere - 1.0, 1.0)
 
+    @cached_property
+    def alike(self) -> Floats:
+        """How many of its node's pictures tell as much as one of each candidate (K,), whose error lasts."""
+        return 1.0 + self.lasting_s / self.apart_s
 
-def sight_of(
-    rig: Rig,
-    node: int,
-    stamp_ns: int,
-    t_s: float,
-    pixels: Floats,
-    sigma_px: Floats,
-    dt_s: Floats,
-    elsewhere: int = 0,
-) -> Sight:
+
+def sight_of(rig: Rig, node: int, t_s: float, frame: FrameSeen) -> Sight:
     """Prepare a picture's candidates; those that the camera model does not reach are left out."""
     with np.errstate(all="ignore"):
-        bearings, tangents = rig.camera.rays(pixels.reshape(-1, 2))
+        bearings, tangents = rig.camera.rays(frame.pixels.reshape(-1, 2))
+    dt_s = np.zeros(len(frame.pixels))
+    if len(frame.dt_ns):
+        dt_s += frame.dt_ns * 1e-9
+    lasting_s = frame.lasting_s if len(frame.lasting_s) else np.zeros(len(frame.pixels))
+    sigma_px = frame.sigma_px
     sound = np.isfinite(bearings).all(1) & np.isfinite(tangents).all((1, 2)) & np.isfinite(sigma_px) & (sigma_px > 0.0)
-    return Sight(stamp_ns, t_s, node, bearings[sound], tangents[sound], sigma_px[sound], dt_s[sound], elsewhere)
+    return Sight(
+        frame.stamp_ns,
+        t_s,
+        node,
+        bearings[sound],
+        tangents[sound],
+        sigma_px[sound],
+        dt_s[sound],
+        lasting_s[sound],
+        frame.elsewhere,
+    )

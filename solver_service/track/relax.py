@@ -33,6 +33,7 @@ from buddyline.solver_service.track.seeing import (
     ONE_TRIGGER_S,
     BySight,
     PassGuide,
+    counted,
     in_front,
     learn_detection,
     light_rows,
@@ -179,7 +180,7 @@ class PathPass(TrackSteps):
                 run = []
             guide = self.guides.get((sight.node, sight.stamp_ns)) if isinstance(sight, Sight) else None
             if guide is not None and isinstance(sight, Sight):
-                run.append((guide, sight))
+                run.append((guide, self._hear(sight, t_s)))
         if run:
             self._take_run(run)
         self._forget_before(self.passed.t_s - KEPT_S)
@@ -304,7 +305,7 @@ class PathPass(TrackSteps):
         learn_detection(main.detection[observer], inside, found.seen)
         if all(inside):
             self.lamps.take(1 - observer, sight.t_s, found.seen)
-        return replace(found, chosen=in_front(found.chosen, by_path.y))
+        return replace(found, chosen=counted(in_front(found.chosen, by_path.y), sight, main))
 
     def _apply(self, estimate: Estimate, H: Floats, y: Floats, noise: Floats, *, teaches: bool = False) -> float:
         error, chi2 = told_by(estimate, H, y - H @ self._off, noise, teaches=teaches)

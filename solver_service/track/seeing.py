@@ -142,6 +142,8 @@ class TrackSights(TrackMoves):
             if not estimate.confirmed:
                 estimate.used[observer, sight.stamp_ns] = found.chosen
                 found = replace(found, chosen=_doubted(found.chosen, estimate, sight, H))
+            else:
+                found = replace(found, chosen=counted(found.chosen, sight, estimate))
             self._update_lights(estimate, found, y, H, sight)
             if estimate.unseen_by == observer:
                 estimate.unseen_by = None
@@ -289,6 +291,16 @@ def light_rows(chosen: Chosen, y: Floats, H: Floats) -> tuple[Floats, Floats, Fl
     rows_y = np.concatenate([y[k, light] for k, light, _ in chosen])
     variances = np.array([variance for _, _, variance in chosen])
     return rows_H, rows_y, noise_of(variances, of_lights[..., -1], np.zeros(len(chosen)))
+
+
+def counted(chosen: Chosen, sight: Sight, estimate: Estimate) -> Chosen:
+    """Give a picture's lights with the variances that they count with, for their errors may be those of others, too.
+
+    Where motion is guessed an estimate hardly reaches beyond one picture, and they count as they are.
+    """
+    if any(estimate.without):
+        return chosen
+    return tuple((k, light, variance * float(sight.alike[k])) for k, light, variance in chosen)
 
 
 def noise_of(variances: Floats, by_time: Floats, pictures: NDArray[Any]) -> Floats:

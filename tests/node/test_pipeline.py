@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 from buddyline.node.detect import Detection, make_detector
+from buddyline.node.detect.detection import CLIPPED, LASTING_S
 from buddyline.node.devices import CAMERAS, Frame, load
 from buddyline.node.pipeline import Pipeline, blobs_of
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import MAX_BLOBS, Blob
+from msgspec import UNSET
 from msgspec.json import encode
 
 PERIOD_NS = 100_000_000
@@ -33,7 +35,7 @@ def test_digits_far_below_the_errors_are_not_sent():
         v_px=0.1 + 0.2,
         sigma_px=0.0123456789,
         area_px=458.0346984863281,
-        peak=254.97,
+        peak=204.97,
         elongation=1.0292036533355713,
         score=0.9588340520858765,
     )
@@ -63,6 +65,13 @@ def test_triggers_are_the_nearest_and_come_once():
     second = pipeline.candidates(frame(9 * PERIOD_NS - 1_000_000))
     assert (second.trigger, second.seq) == (9, 1)
     assert pipeline.residual_s == pytest.approx(0.001)
+
+
+@pytest.mark.parametrize(("peak", "lasting_s"), [(CLIPPED, LASTING_S), (CLIPPED - 1.0, UNSET)])
+def test_a_light_with_a_clipped_core_tells_for_how_long_its_error_lasts(peak, lasting_s):
+    blob = Blob(u_px=5.0, v_px=5.0, sigma_px=0.1, area_px=9.0, peak=peak, elongation=1.0)
+    (sent,), _ = blobs_of([Detection(blob, NOTHING, NOTHING, "")], frame())
+    assert sent.lasting_s == lasting_s
 
 
 def test_an_unknown_device_is_refused_with_the_known_names():

@@ -177,10 +177,13 @@ def an_estimate(state: NetState) -> NetEstimate:
 
 
 def test_lights_of_one_picture_share_the_error_of_its_stamp_whosever_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Member 0 sees both others in one picture, member 1 one of them in another."""
+    """Member 0 sees both others in one picture, member 1 one of them in another, whose errors last for two more."""
     estimate, rng = an_estimate(a_state(7)), np.random.default_rng(8)
-    nothing = np.zeros(0)
-    one, two = (Sight(0, 0.0, node, np.zeros((0, 3)), np.zeros((0, 2, 3)), nothing, nothing) for node in (0, 1))
+    sigma_px, dt_s = np.ones(1), np.zeros(1)
+    one, two = (
+        Sight(0, 0.0, node, np.zeros((1, 3)), np.zeros((1, 2, 3)), sigma_px, dt_s, np.array((lasting_s,)), apart_s=0.1)
+        for node, lasting_s in enumerate((0.0, 0.2))
+    )
     bars = [Bar(0, 1, one), Bar(0, 2, one), Bar(1, 2, two)]
     which = columns([bar.observer for bar in bars], [bar.other for bar in bars])
     y, H = rng.normal(0.0, 1.0, (3, 1, 2, 2)), rng.normal(0.0, 300.0, (3, 1, 2, 2, WIDTH + 1))
@@ -191,6 +194,10 @@ def test_lights_of_one_picture_share_the_error_of_its_stamp_whosever_they_are(mo
     late = STAMP_SIGMA_S * np.concatenate([H[n, 0, n % 2, :, -1] for n in range(3)])
     expected = 0.5 * np.eye(6) + np.outer(late, late)
     expected[:4, 4:] = expected[4:, :4] = 0.0
+    estimate.members[2].without = True
+    estimate._update(bars, which, y, H, [(n, 0, n % 2, 0.5) for n in range(3)])
+    assert applied[1][1] == pytest.approx(expected)
+    expected[4:, 4:] += 2.0 * 0.5 * np.eye(2)
     assert noise == pytest.approx(expected)
     assert rows[4:, which[2]] == pytest.approx(H[2, 0, 0, :, :-1])
 

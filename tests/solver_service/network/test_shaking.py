@@ -6,7 +6,7 @@ from buddyline.solver_service.network.state import BLOCK, MOVING, P_
 
 
 def test_places_known_together_only_do_not_let_a_members_part_grow_without_an_end() -> None:
-    """A light moves both places by two or three times what they are apart: by itself, each part would grow with each."""
+    """A light moves both places by two or three times what they are off: by itself, each part would grow each time."""
     shaking = NetShaking.of_none().joined().joined()
     drawn = shaking_parts(np.eye(3)[None].repeat(2, 0), np.full(2, 0.1))
     P, H = 1e-6 * np.eye(1 + 2 * BLOCK), np.zeros((3, 1 + 2 * BLOCK))

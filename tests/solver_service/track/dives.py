@@ -25,7 +25,10 @@ FOCAL_PX, WIDTH_PX, HEIGHT_PX = 900.0, 820, 616
 
 @dataclass(frozen=True)
 class Setting:
-    """What a dive is like. poor: the inertial units are off their mounts, late, off their told place, and walk."""
+    """What a dive is like. poor: the inertial units are off their mounts, late, off their told place, and walk.
+
+    lasting_s: half of each light's variance is of an error that wanders, exp(-t / lasting_s); candidates tell so.
+    """
 
     seconds: float = 30.0
     rate_hz: float = 10.0
@@ -38,6 +41,7 @@ class Setting:
     dark_s: tuple[float, float] | None = None
     clock_s: float = 0.0
     depth_offset_m: float = 0.0
+    lasting_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -178,6 +182,8 @@ def _frames(
     lamps: Lamps | None,
 ) -> list[tuple[FrameSeen | None, Floats]]:
     """Each trigger's frame, and which of the other's lights are truly in it (2,); the lights' pixels come first."""
+    wander, wandered_s = rng.spawn(1)[0], -math.inf
+    wandering = np.zeros((2, 2))
     hidden = rng.uniform(0.0, setting.seconds, (2, 2))
     lengths = rng.uniform(0.5, 2.5, (2, 2))
     out: list[tuple[FrameSeen | None, Floats]] = []
@@ -197,7 +203,12 @@ def _frames(
         if setting.dark_s and setting.dark_s[0] <= t <= setting.dark_s[1]:
             inside[:] = False
         gross = rng.uniform(size=2) < 0.03
-        noisy = true + rng.normal(0.0, 1.0, (2, 2)) * np.where(gross, 6.0, setting.sigma_px)[:, None]
+        own = rng.normal(0.0, 1.0, (2, 2))
+        if setting.lasting_s:
+            kept = math.exp((wandered_s - t) / setting.lasting_s)
+            wandering = kept * wandering + math.sqrt(1.0 - kept**2) * wander.normal(0.0, 1.0, (2, 2))
+            own, wandered_s = math.sqrt(0.5) * (own + wandering), t
+        noisy = true + own * np.where(gross, 6.0, setting.sigma_px)[:, None]
         false = rng.uniform((0.0, 0.0), (WIDTH_PX - 1.0, HEIGHT_PX - 1.0), (rng.poisson(setting.false), 2))
         pixels = np.concatenate((noisy[inside], false))
         if lamps is not None:
@@ -205,7 +216,9 @@ def _frames(
         if rng.uniform() < 0.02:
             out.append((None, inside))
             continue
-        frame = FrameSeen(EPOCH_NS + round(t * 1e9), pixels, np.full(len(pixels), setting.sigma_px))
+        sigma_px = np.full(len(pixels), setting.sigma_px)
+        lasting_s = np.full(len(pixels), setting.lasting_s)
+        frame = FrameSeen(EPOCH_NS + round(t * 1e9), pixels, sigma_px, lasting_s=lasting_s)
         out.append((frame, inside & ~gross))
     return out
 

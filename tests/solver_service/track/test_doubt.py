@@ -12,6 +12,7 @@ from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rot
 from buddyline.solver_service.track.association import LIKELY, SURE, Association, associate
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
+from buddyline.solver_service.track.inputs import FrameSeen
 from buddyline.solver_service.track.lights import (
     Sight,
     in_picture,
@@ -163,7 +164,7 @@ def picture(track: TrackFilter, estimate: Estimate, turned_rad: Floats) -> Sight
     X, _ = light_positions(estimate.state, 0, lights_m, estimate.rates_radps, np.zeros(1))
     pixels = project(X[0] @ rotation_exp(turned_rad))
     assert all(in_picture(rig.camera, pixel, 2.0) for pixel in pixels)
-    return sight_of(rig, 0, 0, estimate.t_s, pixels, np.full(2, SIGMA_PX), np.zeros(2))
+    return sight_of(rig, 0, estimate.t_s, FrameSeen(0, pixels, np.full(2, SIGMA_PX)))
 
 
 @pytest.mark.parametrize("turned_rad", [0.0, 0.04])
@@ -241,7 +242,7 @@ def test_a_picture_without_a_light_is_one_of_a_node_that_looks_away_until_it_sho
 ) -> None:
     track, known, calm = without_units
     estimate = known.copied()
-    nothing = sight_of(track.nodes[0].rig, 0, 0, calm.t_s, np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+    nothing = sight_of(track.nodes[0].rig, 0, calm.t_s, FrameSeen(0, np.zeros((0, 2)), np.zeros(0)))
     track._step(estimate, calm.t_s, nothing)
     assert estimate.looks_away[0]
     track._step(estimate, calm.t_s + 0.001, calm)

@@ -18,6 +18,7 @@ from buddyline.solver_service.track import seeing
 from buddyline.solver_service.track.association import Association, associate
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
+from buddyline.solver_service.track.inputs import FrameSeen
 from buddyline.solver_service.track.lights import COLUMNS, Sight, light_positions, residuals, sight_of
 from buddyline.solver_service.track.moving import HOLD_S, KNOWN_CLOCK_S
 from buddyline.solver_service.track.records import last_ns
@@ -49,7 +50,7 @@ def test_a_picture_of_a_counts_the_product_of_clock_and_velocity_errors() -> Non
     rig = make(1, Setting(seconds=1.0)).records[0].node.rig
     X, D = light_positions(state, 0, LIGHTS_M, np.zeros((2, 3)), np.zeros(1))
     pixel = np.array((409.5, 307.5)) + 900.0 * X[0, 0, :2] / X[0, 0, 2]
-    sight = sight_of(rig, 0, 0, 0.0, pixel[None], np.array((0.7,)), np.zeros(1))
+    sight = sight_of(rig, 0, 0.0, FrameSeen(0, pixel[None], np.array((0.7,))))
     y0, H0 = of_light(state, sight)
     of_errors = np.r_[CLOCK, V_]
     P = np.zeros((SIZE, SIZE))
@@ -185,7 +186,7 @@ def test_lights_after_seconds_of_darkness_are_believed_where_they_are() -> None:
         rig, lights_m = track.nodes[node].rig, track.nodes[1 - node].rig.lights_m
         X, _ = light_positions(known.state, node, lights_m, known.rates_radps, np.zeros(1))
         pixels = np.array((409.5, 307.5)) + 900.0 * X[0, :, :2] / X[0, :, 2:]
-        sights.append(sight_of(rig, node, 0, known.t_s, pixels, np.full(2, 0.7), np.zeros(2)))
+        sights.append(sight_of(rig, node, known.t_s, FrameSeen(0, pixels, np.full(2, 0.7))))
     roots = np.zeros(SIZE)
     roots[R_], roots[PHI[0]], roots[PHI[1]] = 0.7, 0.03, 0.06
     rng = np.random.default_rng(7)

@@ -12,18 +12,23 @@ from buddyline.protocol.messages import Imu
 from buddyline.solver_service.track import dive as dive_track
 from buddyline.solver_service.track import relax
 from buddyline.solver_service.track.dive import smooth
+from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
-from buddyline.solver_service.track.inputs import FixSeen
+from buddyline.solver_service.track.inputs import FixSeen, FrameSeen
 from buddyline.solver_service.track.lag import TrackLag
+from buddyline.solver_service.track.lights import sight_of
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.records import NodeRecord, joined, last_ns
+from buddyline.solver_service.track.seeing import counted
 from buddyline.solver_service.track.smoother import Path, smoothed
+from buddyline.solver_service.track.state import SIZE, State
 from buddyline.solver_service.track.trail import Trail
 
 from tests.solver_service.track.assignments import weigh
 from tests.solver_service.track.dives import EPOCH_NS, KnownDive, Setting, bare_of, filter_of, fix_errors, make, score
 
 SHORT = Setting(seconds=12.0)
+NO_TIME = np.zeros(0)
 
 
 @pytest.fixture(scope="module")
@@ -190,6 +195,34 @@ def test_lag_is_better_than_the_filter(dive: KnownDive) -> None:
     assert judged.rows > 0.8 * len(dive.stamps_ns)
     assert np.percentile(judged.errors_m, 95) < np.percentile(score(dive, causal).errors_m, 95)
     assert 0.3 < judged.nees < 2.0
+
+
+@pytest.mark.parametrize("poor", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_errors_of_lights_that_last_count_once_where_the_node_tells_of_them(poor: bool) -> None:
+    """Half of their variance is the same a second later: taken for new in each picture, the track would be too sure."""
+    dive = make(2, replace(SHORT, seconds=20.0, poor=poor, lasting_s=1.3))
+    untold = [
+        replace(record, frames=[replace(frame, lasting_s=NO_TIME) for frame in record.frames])
+        for record in dive.records
+    ]
+    told, unknown = (smooth((a, b), dive.fixes, dive.stamps_ns).rows for a, b in (dive.records, untold))
+    assert 0.3 < score(dive, told).nees < 1.5
+    assert score(dive, unknown).nees > 2.5
+    causal = filter_of(dive.records, dive.fixes).advance(last_ns(dive.records), dive.stamps_ns)
+    assert 0.15 < score(dive, causal).nees < 1.5
+
+
+def test_a_light_whose_error_lasts_counts_by_the_rate_of_pictures(dive: KnownDive) -> None:
+    track = TrackFilter(dive.records[0].node, dive.records[1].node, keep_s=0.0)
+    frame = FrameSeen(0, np.full((2, 2), 300.0), np.full(2, 0.7), lasting_s=np.array((0.0, 1.5)))
+    sights = [sight_of(track.nodes[0].rig, 0, t_s, frame) for t_s in (1.0, 1.2, 1.2)]
+    heard = [track._hear(sight, sight.t_s) for sight in sights]
+    assert np.array([sight.alike for sight in heard]) == pytest.approx(np.array(((1.0, 1.0), (1.0, 8.5), (1.0, 1.0))))
+    estimate = Estimate(1.0, State.at_rest(np.zeros(3), np.eye(3)[None].repeat(2, 0)), np.eye(SIZE), 1.0)
+    chosen = (0, 0, 0.5), (1, 1, 0.5)
+    assert counted(chosen, heard[1], estimate) == ((0, 0, 0.5), (1, 1, pytest.approx(4.25)))
+    estimate.without[1] = True
+    assert counted(chosen, heard[1], estimate) == chosen
 
 
 @pytest.mark.slow
