@@ -21,7 +21,8 @@ from buddyline.solver_service.results import NUMERIC_ERRORS, view_of
 from buddyline.solver_service.streams import STOPPED_NS, NodeStream
 from buddyline.solver_service.track.inputs import DepthSeen
 from buddyline.solver_service.track.problems import as_ended
-from buddyline.solver_service.tracking import TrackSettings, attitudes_of, fix_of, frame_of, same_rig, track_node_of
+from buddyline.solver_service.track_messages import attitudes_of, fix_of, frame_of, same_rig, track_node_of
+from buddyline.solver_service.tracking import TrackSettings
 from msgspec import UNSET
 
 NET: Final = "main"
