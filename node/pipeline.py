@@ -39,7 +39,7 @@ def _rounded(blob: Blob, dt_ns: int) -> Blob:
         elongation=round(blob.elongation, 3),
         dt_ns=dt_ns,
         score=UNSET if blob.score is UNSET else round(blob.score, 4),
-        lasting_s=LASTING_S if blob.peak >= CLIPPED else UNSET,
+        lasting_s=LASTING_S if blob.lasting_s is UNSET and blob.peak >= CLIPPED else blob.lasting_s,
     )
 
 

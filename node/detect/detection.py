@@ -20,8 +20,8 @@ FOCAL_PX: Final = 904.0
 """Focal length for which the detectors' lengths in px are given: that of the default rig, with pictures 820 px wide."""
 LASTING_S: Final = 1.3
 """For how long the error of a light with a clipped core stays the same, whatever finds it: its glow, its beam and the
-water tell where it is, and they change as slowly as the divers swim. The errors' integrated autocorrelation time: the
-median of the five dives kept for tuning, which have 0.7 to 2.2 s. Cores that are not clipped show less than 0.2 s."""
+water tell where it is, and they change as slowly as the divers swim. As Blob has it: the median of the five dives kept
+for tuning, which have 0.7 to 2.2 s. Where the exposure is locked to the lamps, errors last for less than 0.2 s."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,8 +15,8 @@ class Blob(Struct, frozen=True, kw_only=True):
     """One light candidate. Pixel centres at integers, distorted image.
 
     dt_ns: exposure time of its row minus the frame's stamp_ns. peak: grey levels. score: probability of a light, 0-1.
-    lasting_s: for how long its error stays the same from picture to picture, the errors' integrated autocorrelation
-    time; absent where each picture's is its own.
+    lasting_s: for how long its error lasts from picture to picture, 2 times the integral of the error's autocorrelation
+    over the time between two pictures; absent where each picture's is its own.
     """
 
     u_px: float
@@ -27,7 +27,7 @@ class Blob(Struct, frozen=True, kw_only=True):
     elongation: NonNegative
     dt_ns: int = 0
     score: Annotated[float, Meta(ge=0, le=1)] | UnsetType = UNSET
-    lasting_s: NonNegative | UnsetType = UNSET
+    lasting_s: Annotated[float, Meta(ge=0, le=3600)] | UnsetType = UNSET
 
 
 class Candidates(Message, frozen=True, kw_only=True):

@@ -44,7 +44,7 @@ class Blinking:
 class View:
     """What one node saw at one trigger: N candidates.
 
-    table: (N, 6), one row a candidate, with the columns that the properties name. stamp_ns: of the frame. elsewhere:
+    table: (N, 7), one row a candidate, with the columns that the properties name. stamp_ns: of the frame. elsewhere:
     how many more the whole picture held, where only parts were searched. blinking: what a code by which the other
     node's lamps blink says; None where they do not.
     """

@@ -23,7 +23,7 @@ from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.association import Odds, odds_of
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.intake import TrackIntake, newest_before
-from buddyline.solver_service.track.lights import Sight, in_picture, pixel_of, residuals, with_stamp
+from buddyline.solver_service.track.lights import Sight, alike, in_picture, pixel_of, residuals, with_stamp
 from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S
 from buddyline.solver_service.track.seeing import EDGE_PX, noise_of
 from buddyline.solver_service.track.start import tilt_of
@@ -75,6 +75,7 @@ class NetEstimate(NetBelief):
 
     dark: nodes without lamps. blinks: how lamps blink, by node. start_s: when a challenger began. evidence: log odds
     over clutter of all pictures so far. detection: by observer and other node, how likely each of its lights is found.
+    lit_s: by observer, other node and light, when it was last used.
     """
 
     def __init__(self, intake: TrackIntake) -> None:
@@ -84,12 +85,14 @@ class NetEstimate(NetBelief):
         self.start_s = -np.inf
         self.evidence = 0.0
         self.detection: dict[tuple[int, int], Floats] = {}
+        self.lit_s: dict[tuple[int, int, int], float] = {}
 
     def copied(self) -> NetEstimate:
         """Give an estimate that goes its own way from here."""
         other = copy.copy(self)
         other.members = [replace(member) for member in self.members]
         other.detection = {pair: of.copy() for pair, of in self.detection.items()}
+        other.lit_s = dict(self.lit_s)
         other.trail = None if self.trail is None else self.trail.copied()
         return other
 
@@ -217,14 +220,17 @@ class NetEstimate(NetBelief):
         for bar in (bars[one] for one, *_ in chosen):
             for member in (self.members[bar.other], self.members[bar.observer]):
                 member.light_s = max(member.light_s, bar.sight.t_s)
-        counted = variances * [self._alike(bars[one], of) for one, of in zip(n, k, strict=True)]
+        counted = variances * [self._alike(bars[bar], candidate, of) for bar, candidate, of, _ in chosen]
         noise = noise_of(counted, H[n, k, light, :, -1], np.array([id(bars[one].sight) for one in n]))
         self._apply(rows.reshape(2 * len(chosen), -1), y[n, k, light].ravel(), noise, teaches=True)
 
-    def _alike(self, bar: Bar, k: int) -> float:
-        """Give how many pictures tell as much as one of a candidate (track/seeing.counted)."""
-        guessed = self.members[bar.observer].without or self.members[bar.other].without
-        return 1.0 if guessed else float(bar.sight.alike[k])
+    def _alike(self, bar: Bar, k: int, light: int) -> float:
+        """Give how many pictures tell as much as this one of a light, candidate k (track/seeing.counted); note it."""
+        observer, other = self.members[bar.observer], self.members[bar.other]
+        key = observer.node, other.node, light
+        apart_s = bar.sight.t_s - self.lit_s.get(key, -math.inf)
+        self.lit_s[key] = bar.sight.t_s
+        return 1.0 if observer.without or other.without else alike(float(bar.sight.lasting_s[k]), apart_s)
 
     def _judge(self) -> None:
         """Confirm members, and remove those of which no light tells any more."""

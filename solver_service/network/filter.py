@@ -214,7 +214,8 @@ class NetFilter(TrackIntake):
     def _take_sights(self, t_s: float, sights: Sequence[Sight]) -> None:
         self._check_units(t_s)
         self._check_fixed(t_s)
-        sights = [self._hear(sight, t_s) for sight in sights]
+        for sight in sights:
+            self._hear(sight.node, t_s)
         if self.main.state is None and self.main.places:
             self.main.begin(t_s)
         for estimate in [self.main, *self.challengers]:

@@ -75,13 +75,14 @@ class NetShaking:
         """Go on by one picture's residuals y (m,), H (m, N), P (N, N), by Fisher's scoring (Shaking.taught).
 
         A node's part does not follow what an update makes of it in other nodes' errors. Between nodes whose places are
-        poorly known, but together, it could grow without an end: it is kept within all of S, tr(S^-1 D) <= m.
+        poorly known, but together, it could grow without an end. It is kept within S: tr(S^-1 D) <= rank D.
         """
         n, m = len(self.logs), len(y)
         H_own = np.swapaxes(H[:, 1:].reshape(m, n, -1), 0, 1)[:, :, :MOVING]
         D = (H_own[:, None] @ self.parts @ np.swapaxes(H_own, 1, 2)[:, None]).reshape(2 * n, m, m)
         W = S_inverse @ D
-        share = np.trace(W, axis1=1, axis2=2) * self.variances.ravel() / m
+        rank = np.repeat(np.clip(H_own.any(axis=2).sum(axis=1), 1, MOVING), 2)
+        share = np.trace(W, axis1=1, axis2=2) * self.variances.ravel() / rank
         above = np.maximum(share, 1.0)[:, None, None]
         D, W, own = D / above, W / above, self.parts / above.reshape(n, 2, 1, 1)
         z = S_inverse @ y

@@ -125,9 +125,7 @@ def smooth(
         return _of_one_lamp_each(known, max(parts, key=lasted_s), outputs_ns)
     # Beside a track of any other start these are not linear enough for the passes below.
     parts = [part for part in parts if not part.lone]
-    told = sum(part.told for part in parts)
-    unrest = min(max(math.sqrt(sum(part.surprise for part in parts) / told), 0.3), 2.0) if told > 100 else 1.0
-    learned = replace(known, walking=joint([part.walking for part in parts]), unrest=unrest)
+    learned = replace(known, walking=joint([part.walking for part in parts]), unrest=_unrest(parts))
     found: list[tuple[PathPass, Path]] = []
     lost: list[str] = []
     since_s, contradicting_ns = -math.inf, None
@@ -160,6 +158,17 @@ def smooth(
         return Smoothed([], clock_ns * 1e-9, math.inf, [*first.problems, *lost])
     whole = _rows_of(found, outputs_ns)
     return replace(whole, problems=[*whole.problems, *lost])
+
+
+def _unrest(parts: Sequence[Estimate]) -> float:
+    """Give how much of the guessed motion's noise a dive's chi^2 asks for, 1 where it does not tell.
+
+    Of lights whose errors last it does not: these do not show against a track that has the same errors.
+    """
+    told, lasted = sum(part.told for part in parts), sum(part.lasted for part in parts)
+    if told <= 100 or lasted > 0.5 * told:
+        return 1.0
+    return min(max(math.sqrt(sum(part.surprise for part in parts) / told), 0.3), 2.0)
 
 
 def _clock_s(track: TrackFilter | PathPass, path: Path) -> float:

@@ -33,17 +33,17 @@ class Estimate:
 
     The lights: detection (2, 2): by observer and light, how likely a light in the picture is found. last_seen (2,):
     the probability that each light is among the last picture's candidates, None where not both should be in it.
-    light_s: when a light was last used, at first its start, which is made of lights; trigger: time, observer and light
-    of those of the last trigger. pictures: how many it has taken since it is confirmed; bare: of these, how many while
-    a node had no inertial unit. bars: how many pictures showed both lights, bar_s: when one last did; told_by: how many
-    of each node showed any. missed: in how many of each node's last pictures, on end, a light should be and none was
-    used. looks_away: whether each node's last picture has shown none, wherever they should be. unseen_by: a node that
-    has shown no light yet.
+    lit_s (2, 2): when each was last used. light_s: when any was, at first the start, which is made of lights; trigger:
+    time, observer and light of those of the last trigger. pictures: how many it has taken since it is confirmed; bare:
+    of these, how many while a node had no inertial unit. bars: how many pictures showed both lights, bar_s: when one
+    last did; told_by: how many of each node showed any. missed: in how many of each node's last pictures, on end, a
+    light should be and none was used. looks_away: whether each node's last picture has shown none, wherever they should
+    be. unseen_by: a node that has shown no light yet.
 
     How well it fits: evidence: log odds over clutter; evidence_by: of each node's pictures. baseline: the main
-    estimate's at the start. surprise, told: chi^2 of the lights used, and of how many residuals. agreed_s: when a fix
-    last agreed with it, inf where none did; agreed: how many did; contradicted: how many since then did not;
-    gap_chi2: the running mean of the fixes' chi^2.
+    estimate's at the start. surprise, told: chi^2 of the lights used, and of how many residuals; lasted: of how many
+    with errors that last. agreed_s: when a fix last agreed with it, inf where none did; agreed: how many did;
+    contradicted: how many since then did not; gap_chi2: the running mean of the fixes' chi^2.
 
     Its life: searched: it started without a fix; lone: from single lamps. skip_s: pictures within this after start_s
     made it, and tell nothing new. patience_s: how long it may stay unconfirmed. end_s: later pictures are not its own.
@@ -61,6 +61,7 @@ class Estimate:
     baseline: float = 0.0
     detection: Floats = field(default_factory=lambda: np.full((2, 2), 0.8))
     rates_radps: Floats = field(default_factory=lambda: np.zeros((2, 3)))
+    lit_s: Floats = field(default_factory=lambda: np.full((2, 2), -np.inf))
     light_s: float = -np.inf
     trigger: list[tuple[float, int, int]] = field(default_factory=list)
     attitude_s: list[float] = field(default_factory=lambda: [-np.inf, -np.inf])
@@ -75,6 +76,7 @@ class Estimate:
     wide: bool = False
     surprise: float = 0.0
     told: int = 0
+    lasted: int = 0
     end_s: float = np.inf
     skip_s: float = 0.02
     patience_s: float = CHALLENGE_S
@@ -116,7 +118,8 @@ class Estimate:
         of_nodes = "evidence_by", "attitude_s", "told_by", "missed", "looks_away", "without", "turning_off"
         lists = *of_nodes, "trigger", "course", "saw"
         own: dict[str, object] = {name: list(getattr(self, name)) for name in lists}
-        own |= {"detection": self.detection.copy(), "steps": self.steps.copy(), "used": dict(self.used)}
+        own |= {"detection": self.detection.copy(), "lit_s": self.lit_s.copy()}
+        own |= {"steps": self.steps.copy(), "used": dict(self.used)}
         return replace(self, **(own | changes))  # type: ignore[arg-type]
 
     def gained_since(self, t_s: float) -> float:

@@ -188,7 +188,7 @@ class TrackFilter(TrackPool):
 
     def _take_sight(self, t_s: float, sight: Sight) -> None:
         self._check_units(t_s)
-        sight = self._hear(sight, t_s)
+        self._hear(sight.node, t_s)
         if self.gone(1 - sight.node, t_s):
             self._go_on_alone(t_s, 1 - sight.node)
             return

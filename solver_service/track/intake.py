@@ -26,8 +26,6 @@ SILENT_S: Final = 1.0
 GONE_S: Final = 0.5
 GONE_PICTURES: Final = 3
 LEAST_SIGMA_RAD: Final = 1e-3
-# No camera takes its pictures faster.
-LEAST_APART_S: Final = 1e-3
 # Taken for roll, pitch and yaw where a message states a sigma below LEAST_SIGMA_RAD, which no attitude filter reaches.
 UNTOLD_SIGMA_RAD: Final = np.radians((1.5, 1.5, 6.0))
 # No fix's numbers, in m, rad and their squares, are as large.
@@ -162,12 +160,10 @@ class TrackIntake:
                 self._problems.report(said, t_s)
                 self._rejected[node] = samples.rejected
 
-    def _hear(self, sight: Sight, t_s: float) -> Sight:
-        """Note a node's picture, which has its turn; give it with the time since the one before."""
-        before_s, _ = self._pictured_s.get(sight.node, (t_s, 0.0))
-        apart_s = max(t_s - before_s, 0.0)
-        self._pictured_s[sight.node] = t_s, apart_s
-        return replace(sight, apart_s=apart_s) if apart_s > LEAST_APART_S else sight
+    def _hear(self, node: int, t_s: float) -> None:
+        """Note a node's picture, which has its turn."""
+        before_s, _ = self._pictured_s.get(node, (t_s, 0.0))
+        self._pictured_s[node] = t_s, max(t_s - before_s, 0.0)
 
     def between_pictures_s(self, node: int) -> float:
         """Give how long passed between a node's last two pictures, 0 before there are two."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -20,6 +19,8 @@ COLUMNS: Final = np.array((*range(NAV), CLOCK))
 BLOCK: Final = np.ix_(COLUMNS, COLUMNS)
 # Newton's method ends with a step below this: the next would be its square.
 SMALL_PX: Final = 1e-4
+# No camera takes its pictures faster.
+LEAST_APART_S: Final = 1e-3
 
 
 def light_positions(
@@ -165,7 +166,6 @@ class Sight:
     """One picture as the track uses it: bearings and tangents of its sound candidates.
 
     t_s: on A's clock as believed; dt_s (K,): of each candidate after it. elsewhere, lasting_s (K,): as in FrameSeen.
-    apart_s: time since its node's picture before, inf where there is none.
     """
 
     stamp_ns: int
@@ -177,17 +177,16 @@ class Sight:
     dt_s: Floats
     lasting_s: Floats
     elsewhere: int = 0
-    apart_s: float = math.inf
 
     @property
     def clutter(self) -> float:
         """How many candidates chance may have put into the whole picture: all but one, and never none."""
         return max(len(self.bearings) + self.elsewhere - 1.0, 1.0)
 
-    @cached_property
-    def alike(self) -> Floats:
-        """How many of its node's pictures tell as much as one of each candidate (K,), whose error lasts."""
-        return 1.0 + self.lasting_s / self.apart_s
+
+def alike(lasting_s: float, apart_s: float) -> float:
+    """Give how many pictures tell as much as one of a light whose errors last, apart_s after it was last used."""
+    return 1.0 + lasting_s / max(apart_s, LEAST_APART_S)
 
 
 def sight_of(rig: Rig, node: int, t_s: float, frame: FrameSeen) -> Sight:

@@ -35,8 +35,10 @@ from buddyline.solver_service.track.seeing import (
     PassGuide,
     counted,
     in_front,
+    lasting,
     learn_detection,
     light_rows,
+    note_lit,
     stacked,
     told_by,
 )
@@ -180,7 +182,7 @@ class PathPass(TrackSteps):
                 run = []
             guide = self.guides.get((sight.node, sight.stamp_ns)) if isinstance(sight, Sight) else None
             if guide is not None and isinstance(sight, Sight):
-                run.append((guide, self._hear(sight, t_s)))
+                run.append((guide, sight))
         if run:
             self._take_run(run)
         self._forget_before(self.passed.t_s - KEPT_S)
@@ -256,6 +258,7 @@ class PathPass(TrackSteps):
         """Take the depths and the pictures of a step together."""
         main = self.passed
         rows: list[tuple[Floats, Floats, Floats]] = []
+        more: list[Floats] = []
         looks: list[Look] = []
         lights: list[tuple[float, int, int]] = []
         depth = self._depth_of(main, step.t_s)
@@ -264,11 +267,15 @@ class PathPass(TrackSteps):
             off = float(y[0] - H[0] @ self._off)
             if off * off < DEPTH_GATE * (float(H[0] @ main.covariance @ H[0]) + variance):
                 rows.append((H, y, np.array(((variance,),))))
+                more.append(np.zeros(1))
         for sight, by_path in seen:
             main.trigger = [one for one in main.trigger if abs(sight.t_s - one[0]) < ONE_TRIGGER_S]
             found = self._associated(sight, by_path)
-            looks.append(Look(sight.node, sight.stamp_ns, sight.t_s, found.chosen))
+            counts = found.chosen if self._keeps else counted(found.chosen, sight, main)
+            looks.append(Look(sight.node, sight.stamp_ns, sight.t_s, counts))
             if found.chosen:
+                more.append(lasting(found.chosen, counts))
+                note_lit(main, sight, counts)
                 rows.append(light_rows(found.chosen, by_path.y, by_path.H))
                 used = [(sight.t_s, sight.node, light) for _, light, _ in found.chosen]
                 lights += used
@@ -277,7 +284,8 @@ class PathPass(TrackSteps):
         if rows:
             H, y, noise = stacked(rows)
             others = len(y) - 2 * len(lights)
-            error, chi2 = told_by(main, H, y - H @ self._off, noise, teaches=bool(lights), others=others)
+            y, beside = y - H @ self._off, np.concatenate(more)
+            error, chi2 = told_by(main, H, y, noise, lasting=beside, teaches=bool(lights), others=others)
             self._off = self._off + error
             if lights:
                 main.surprise += chi2
@@ -305,10 +313,19 @@ class PathPass(TrackSteps):
         learn_detection(main.detection[observer], inside, found.seen)
         if all(inside):
             self.lamps.take(1 - observer, sight.t_s, found.seen)
-        return replace(found, chosen=counted(in_front(found.chosen, by_path.y), sight, main))
+        return replace(found, chosen=in_front(found.chosen, by_path.y))
 
-    def _apply(self, estimate: Estimate, H: Floats, y: Floats, noise: Floats, *, teaches: bool = False) -> float:
-        error, chi2 = told_by(estimate, H, y - H @ self._off, noise, teaches=teaches)
+    def _apply(
+        self,
+        estimate: Estimate,
+        H: Floats,
+        y: Floats,
+        noise: Floats,
+        *,
+        lasting: Floats | None = None,
+        teaches: bool = False,
+    ) -> float:
+        error, chi2 = told_by(estimate, H, y - H @ self._off, noise, lasting=lasting, teaches=teaches)
         self._off = self._off + error
         return chi2
 

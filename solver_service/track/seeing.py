@@ -18,6 +18,7 @@ from buddyline.solver_service.track.lights import (
     BLOCK,
     COLUMNS,
     Sight,
+    alike,
     light_positions,
     residuals,
     share_within,
@@ -124,7 +125,7 @@ class TrackSights(TrackMoves):
 
             found, estimate.covariance, turn = with_sudden(estimate, self._turning_s(estimate), likely)
         if wide and found.chosen and estimate.confirmed:
-            y, H = self._about(estimate, sight, found.chosen, guide)
+            y, H = self._about(estimate, sight, counted(found.chosen, sight, estimate), guide)
         # What another estimate chose may be behind the camera by this one.
         if len(chosen := in_front(found.chosen, y)) < len(found.chosen):
             found = replace(found, chosen=chosen)
@@ -142,9 +143,7 @@ class TrackSights(TrackMoves):
             if not estimate.confirmed:
                 estimate.used[observer, sight.stamp_ns] = found.chosen
                 found = replace(found, chosen=_doubted(found.chosen, estimate, sight, H))
-            else:
-                found = replace(found, chosen=counted(found.chosen, sight, estimate))
-            self._update_lights(estimate, found, y, H, sight)
+            found = replace(found, chosen=self._update_lights(estimate, found, y, H, sight))
             if estimate.unseen_by == observer:
                 estimate.unseen_by = None
             if len(found.chosen) == 2:
@@ -228,29 +227,56 @@ class TrackSights(TrackMoves):
                 error = anchors.kalman(estimate.covariance, *light_rows(near, y, H)).error
         return y, H
 
-    def _update_lights(self, estimate: Estimate, found: Association, y: Floats, H: Floats, sight: Sight) -> None:
+    def _update_lights(self, estimate: Estimate, found: Association, y: Floats, H: Floats, sight: Sight) -> Chosen:
+        """Update an estimate by a picture's lights; return them with the variances that they counted with."""
+        used = counted(found.chosen, sight, estimate)
         rows_H, rows_y, noise = light_rows(found.chosen, y, H)
-        chi2 = self._apply(estimate, rows_H, rows_y, noise, teaches=True)
+        beside = lasting(found.chosen, used)
+        chi2 = self._apply(estimate, rows_H, rows_y, noise, lasting=beside, teaches=True)
+        estimate.lasted += int(np.count_nonzero(beside))
+        note_lit(estimate, sight, used)
         estimate.surprise += chi2
         estimate.told += len(rows_y)
         estimate.light_s = max(estimate.light_s, sight.t_s)
         estimate.trigger += [(sight.t_s, sight.node, light) for _, light, _ in found.chosen]
+        return used
 
-    def _apply(self, estimate: Estimate, H: Floats, y: Floats, noise: Floats, *, teaches: bool = False) -> float:
-        error, chi2 = told_by(estimate, H, y, noise, teaches=teaches)
+    def _apply(
+        self,
+        estimate: Estimate,
+        H: Floats,
+        y: Floats,
+        noise: Floats,
+        *,
+        lasting: Floats | None = None,
+        teaches: bool = False,
+    ) -> float:
+        error, chi2 = told_by(estimate, H, y, noise, lasting=lasting, teaches=teaches)
         estimate.state = estimate.state.plus(error)
         return chi2
 
 
 def told_by(
-    estimate: Estimate, H: Floats, y: Floats, noise: Floats, *, teaches: bool, others: int = 0
+    estimate: Estimate,
+    H: Floats,
+    y: Floats,
+    noise: Floats,
+    *,
+    lasting: Floats | None = None,
+    teaches: bool,
+    others: int = 0,
 ) -> tuple[Floats, float]:
     """Update all but an estimate's state; give the error (SIZE,) to add to that, and chi^2 of the residuals y (m,).
 
-    teaches: whether shaking and shares learn. others: how many rows, the first ones, are not of lights.
+    lasting (m,): by how much variances count more than they are, in all but chi^2. teaches: whether shaking and shares
+    learn. others: how many rows, the first ones, are not of lights.
     """
     before = estimate.covariance
-    error, estimate.covariance, chi2, S_inverse, gain = anchors.kalman(before, H, y, noise)
+    if lasting is None or not lasting.any():
+        error, estimate.covariance, chi2, S_inverse, gain = anchors.kalman(before, H, y, noise)
+    else:
+        error, estimate.covariance, _, S_inverse, gain = anchors.kalman(before, H, y, noise + np.diag(lasting))
+        chi2 = float(y @ np.linalg.solve(H @ before @ H.T + noise, y))
     if estimate.learns and estimate.by_shares.any():
         moved = H @ estimate.by_shares
         if teaches:
@@ -294,13 +320,27 @@ def light_rows(chosen: Chosen, y: Floats, H: Floats) -> tuple[Floats, Floats, Fl
 
 
 def counted(chosen: Chosen, sight: Sight, estimate: Estimate) -> Chosen:
-    """Give a picture's lights with the variances that they count with, for their errors may be those of others, too.
+    """Give a picture's lights with the variances that they count with, for their errors may last from the last ones.
 
-    Where motion is guessed an estimate hardly reaches beyond one picture, and they count as they are.
+    Where motion is guessed an estimate hardly reaches beyond one picture, and they count as they are. So do those of a
+    start, which compete by what they explain.
     """
-    if any(estimate.without):
+    if not estimate.confirmed or any(estimate.without):
         return chosen
-    return tuple((k, light, variance * float(sight.alike[k])) for k, light, variance in chosen)
+    lasting_s, apart_s = sight.lasting_s.tolist(), (sight.t_s - estimate.lit_s[sight.node]).tolist()
+    return tuple((k, light, variance * alike(lasting_s[k], apart_s[light])) for k, light, variance in chosen)
+
+
+def lasting(chosen: Chosen, used: Chosen) -> Floats:
+    """Give by how much the variances of lights (2 N,) count more than they are."""
+    more = [counts - variance for (_, _, variance), (_, _, counts) in zip(chosen, used, strict=True)]
+    return np.repeat(more, 2)
+
+
+def note_lit(estimate: Estimate, sight: Sight, used: Chosen) -> None:
+    """Note when the lights that were used were."""
+    for _, light, _ in used:
+        estimate.lit_s[sight.node, light] = sight.t_s
 
 
 def noise_of(variances: Floats, by_time: Floats, pictures: NDArray[Any]) -> Floats:

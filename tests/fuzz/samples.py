@@ -42,7 +42,18 @@ SOUND: tuple[m.Message, ...] = (
         boot="x",
         width_px=820,
         height_px=616,
-        blobs=[m.Blob(u_px=450.0, v_px=307.0, sigma_px=0.7, area_px=9.0, peak=250.0, elongation=1.0, score=0.5)],
+        blobs=[
+            m.Blob(
+                u_px=450.0,
+                v_px=307.0,
+                sigma_px=0.7,
+                area_px=9.0,
+                peak=250.0,
+                elongation=1.0,
+                score=0.5,
+                lasting_s=1.3,
+            )
+        ],
     ),
     m.Expect(
         **_NODE,

@@ -67,9 +67,12 @@ def test_triggers_are_the_nearest_and_come_once():
     assert pipeline.residual_s == pytest.approx(0.001)
 
 
-@pytest.mark.parametrize(("peak", "lasting_s"), [(CLIPPED, LASTING_S), (CLIPPED - 1.0, UNSET)])
-def test_a_light_with_a_clipped_core_tells_for_how_long_its_error_lasts(peak, lasting_s):
-    blob = Blob(u_px=5.0, v_px=5.0, sigma_px=0.1, area_px=9.0, peak=peak, elongation=1.0)
+@pytest.mark.parametrize(
+    ("peak", "own", "lasting_s"), [(CLIPPED, UNSET, LASTING_S), (CLIPPED - 1.0, UNSET, UNSET), (CLIPPED, 0.4, 0.4)]
+)
+def test_a_light_with_a_clipped_core_tells_for_how_long_its_error_lasts(peak, own, lasting_s):
+    """A detector may tell it by itself."""
+    blob = Blob(u_px=5.0, v_px=5.0, sigma_px=0.1, area_px=9.0, peak=peak, elongation=1.0, lasting_s=own)
     (sent,), _ = blobs_of([Detection(blob, NOTHING, NOTHING, "")], frame())
     assert sent.lasting_s == lasting_s
 

@@ -79,6 +79,7 @@ def dumps(message: object) -> bytes:
         (Candidates, CANDIDATES, {"blobs": [dict(CANDIDATES["blobs"][0], v_px=-0.6)]}, "blobs[0].v_px"),
         (Candidates, CANDIDATES, {"blobs": [dict(CANDIDATES["blobs"][0], sigma_px=0.0)]}, "sigma_px"),
         (Candidates, CANDIDATES, {"blobs": [dict(CANDIDATES["blobs"][0], lasting_s=-0.1)]}, "lasting_s"),
+        (Candidates, CANDIDATES, {"blobs": [dict(CANDIDATES["blobs"][0], lasting_s=1e308)]}, "lasting_s"),
         (Candidates, CANDIDATES, {"blobs": CANDIDATES["blobs"] * 65}, "blobs"),
         (NodeInfo, INFO, {"camera": dict(CAMERA, distortion=[0.0] * 4)}, "distortion"),
         (NodeInfo, INFO, {"light_left_m": [0.44, 0.0, 0.0]}, "light_left_m"),

@@ -116,10 +116,9 @@ def test_a_big_sound_message_is_taken_for_what_is_known_of_it():
 
 
 def beyond_measure(message, what):
-    if isinstance(message, Candidates) and what in ("sigma_px", "area_px"):
-        return replace(
-            message, blobs=[replace(blob, **{what: 1e-300 if what == "sigma_px" else 1e308}) for blob in message.blobs]
-        )
+    least_or_most = {"sigma_px": 1e-300, "area_px": 1e308, "lasting_s": 3600.0}
+    if isinstance(message, Candidates) and what in least_or_most:
+        return replace(message, blobs=[replace(blob, **{what: least_or_most[what]}) for blob in message.blobs])
     if isinstance(message, Depth) and what in ("depth_m", "sigma_m"):
         return replace(message, **{what: 1e308})
     if isinstance(message, Attitude) and what == "sigma_rad":
@@ -127,7 +126,7 @@ def beyond_measure(message, what):
     return message
 
 
-@pytest.mark.parametrize("what", ["sigma_px", "area_px", "depth_m", "sigma_m", "sigma_rad"])
+@pytest.mark.parametrize("what", ["sigma_px", "area_px", "lasting_s", "depth_m", "sigma_m", "sigma_rad"])
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_numbers_beyond_all_measure_cost_no_more_than_their_own_triggers(what):
     messages, _ = dive_messages(seconds=5.0, seed=7)

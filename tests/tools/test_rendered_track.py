@@ -16,26 +16,26 @@ def evaluated(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, A
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", ["smooth", "filter"])
+@pytest.mark.parametrize(("mode", "most"), [("smooth", 2.0), ("filter", 1.2)])
 @pytest.mark.parametrize(("water", "seed", "inertial"), [("basin", 9301, "good"), ("night_reef", 9302, "fair")])
 def test_a_track_by_pictures_and_inertial_units_errs_as_it_says(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], water: str, seed: int, inertial: str, mode: str
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], water: str, seed: int, inertial: str, mode: str, most: float
 ) -> None:
-    """With errors that were taken for new in each picture, NEES / 6 of such dives was 1.9 to 12 (live 0.9 to 3.3)."""
+    """With errors taken for new in each picture, NEES / 6 is 3.7 and 4.9, live 1.6 and 1.6."""
     dive, solved = tmp_path / "dive.mcap", tmp_path / "solved.mcap"
     told = ["--environment", water, "--seed", str(seed), "--seconds", "20", "--images", "--imu", "--inertial", inertial]
     assert main(["simulate", *told, str(dive)]) == 0
     assert main(["solve", str(dive), "-o", str(solved), "--track", mode]) == 0
     [track] = evaluated(capsys, solved, "--truth", dive)["tracks"]
     assert track["wrong"] == 0
-    assert 0.2 < track["nees6"]["mean"] / 6.0 < 2.5
+    assert 0.2 < track["nees6"]["mean"] / 6.0 < most
 
 
 @pytest.mark.slow
 def test_a_network_by_pictures_and_inertial_units_errs_as_it_says(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """NEES / 6 of its nodes was 3.5 to 22 with errors taken for new in each picture."""
+    """With errors taken for new in each picture, NEES / 6 of its nodes is 5.2 and 6.1."""
     dive, solved = tmp_path / "dive.mcap", tmp_path / "solved.mcap"
     told = ["--environment", "night_reef", "--seed", "9303", "--seconds", "12", "--images", "--imu"]
     assert main(["simulate", *told, "--nodes", "3", "--fixed", "a", str(dive)]) == 0
@@ -45,4 +45,4 @@ def test_a_network_by_pictures_and_inertial_units_errs_as_it_says(
     assert len(moving) == 2
     for node in moving:
         assert node["wrong"] == 0
-        assert 0.2 < node["nees6"]["mean"] / 6.0 < 4.0
+        assert 0.2 < node["nees6"]["mean"] / 6.0 < 3.5

@@ -181,7 +181,7 @@ def test_lights_of_one_picture_share_the_error_of_its_stamp_whosever_they_are(mo
     estimate, rng = an_estimate(a_state(7)), np.random.default_rng(8)
     sigma_px, dt_s = np.ones(1), np.zeros(1)
     one, two = (
-        Sight(0, 0.0, node, np.zeros((1, 3)), np.zeros((1, 2, 3)), sigma_px, dt_s, np.array((lasting_s,)), apart_s=0.1)
+        Sight(0, 0.0, node, np.zeros((1, 3)), np.zeros((1, 2, 3)), sigma_px, dt_s, np.array((lasting_s,)))
         for node, lasting_s in enumerate((0.0, 0.2))
     )
     bars = [Bar(0, 1, one), Bar(0, 2, one), Bar(1, 2, two)]
@@ -189,6 +189,7 @@ def test_lights_of_one_picture_share_the_error_of_its_stamp_whosever_they_are(mo
     y, H = rng.normal(0.0, 1.0, (3, 1, 2, 2)), rng.normal(0.0, 300.0, (3, 1, 2, 2, WIDTH + 1))
     applied: list[tuple[Floats, Floats]] = []
     monkeypatch.setattr(NetEstimate, "_apply", lambda _, rows, __, noise, **___: applied.append((rows, noise)))
+    estimate.lit_s[1, 2, 0] = -0.1
     estimate._update(bars, which, y, H, [(n, 0, n % 2, 0.5) for n in range(3)])
     [(rows, noise)] = applied
     late = STAMP_SIGMA_S * np.concatenate([H[n, 0, n % 2, :, -1] for n in range(3)])
