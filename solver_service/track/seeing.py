@@ -320,10 +320,10 @@ def light_rows(chosen: Chosen, y: Floats, H: Floats) -> tuple[Floats, Floats, Fl
 
 
 def counted(chosen: Chosen, sight: Sight, estimate: Estimate) -> Chosen:
-    """Give a picture's lights with the variances that they count with, for their errors may last from the last ones.
+    """Give a picture's lights with the variances that they count with: their errors may be those of the last pictures.
 
-    Where motion is guessed an estimate hardly reaches beyond one picture, and they count as they are. So do those of a
-    start, which compete by what they explain.
+    Where motion is guessed an estimate hardly reaches beyond one picture, and they count as they are. So do those of
+    starts, which compete by what they explain.
     """
     if not estimate.confirmed or any(estimate.without):
         return chosen
