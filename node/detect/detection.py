@@ -19,9 +19,9 @@ CLIPPED: Final = 249.0
 FOCAL_PX: Final = 904.0
 """Focal length for which the detectors' lengths in px are given: that of the default rig, with pictures 820 px wide."""
 LASTING_S: Final = 1.3
-"""For how long the error of a light with a clipped core stays the same, whatever finds it: its glow, its beam and the
-water tell where it is, and they change as slowly as the divers swim. As Blob has it: the median of the five dives kept
-for tuning, which have 0.7 to 2.2 s. Where the exposure is locked to the lamps, errors last for less than 0.2 s."""
+"""For how long the error of a light with a clipped core lasts (Blob.lasting_s), whatever finds the light. Its glow, its
+beam and the water tell where it is, and they change as slowly as the divers swim. It is the median of the five dives
+kept for tuning, which have 0.7 to 2.2 s. Where the exposure is locked to the lamps, errors last for less than 0.2 s."""
 
 
 @dataclass(frozen=True, slots=True)

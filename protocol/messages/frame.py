@@ -15,8 +15,8 @@ class Blob(Struct, frozen=True, kw_only=True):
     """One light candidate. Pixel centres at integers, distorted image.
 
     dt_ns: exposure time of its row minus the frame's stamp_ns. peak: grey levels. score: probability of a light, 0-1.
-    lasting_s: for how long its error lasts from picture to picture, 2 times the integral of the error's autocorrelation
-    over the time between two pictures; absent where each picture's is its own.
+    lasting_s: for how long its error lasts over the next pictures: twice the integral, over time, of the error's
+    autocorrelation. Absent where each picture has an error of its own.
     """
 
     u_px: float

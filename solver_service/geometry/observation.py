@@ -86,7 +86,7 @@ class View:
 
     @property
     def lasting_s(self) -> Floats:
-        """For how long each one's error stays the same (N,), s."""
+        """For how long each one's error lasts (N,), s."""
         return self.table[:, 6]
 
 

@@ -33,7 +33,7 @@ class FrameSeen:
     """The light candidates of one picture.
 
     pixels (K, 2) and sigma_px (K,); dt_ns (K,): each row's exposure minus stamp_ns. elsewhere: how many more the whole
-    picture held, where only parts were searched. lasting_s (K,): for how long each one's error stays the same.
+    picture held, where only parts were searched. lasting_s (K,): for how long each one's error lasts.
     """
 
     stamp_ns: int

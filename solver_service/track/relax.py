@@ -34,8 +34,8 @@ from buddyline.solver_service.track.seeing import (
     BySight,
     PassGuide,
     counted,
+    counted_more,
     in_front,
-    lasting,
     learn_detection,
     light_rows,
     note_lit,
@@ -274,7 +274,7 @@ class PathPass(TrackSteps):
             counts = found.chosen if self._keeps else counted(found.chosen, sight, main)
             looks.append(Look(sight.node, sight.stamp_ns, sight.t_s, counts))
             if found.chosen:
-                more.append(lasting(found.chosen, counts))
+                more.append(counted_more(found.chosen, counts))
                 note_lit(main, sight, counts)
                 rows.append(light_rows(found.chosen, by_path.y, by_path.H))
                 used = [(sight.t_s, sight.node, light) for _, light, _ in found.chosen]
@@ -285,7 +285,7 @@ class PathPass(TrackSteps):
             H, y, noise = stacked(rows)
             others = len(y) - 2 * len(lights)
             y, beside = y - H @ self._off, np.concatenate(more)
-            error, chi2 = told_by(main, H, y, noise, lasting=beside, teaches=bool(lights), others=others)
+            error, chi2 = told_by(main, H, y, noise, beside, teaches=bool(lights), others=others)
             self._off = self._off + error
             if lights:
                 main.surprise += chi2
@@ -315,19 +315,9 @@ class PathPass(TrackSteps):
             self.lamps.take(1 - observer, sight.t_s, found.seen)
         return replace(found, chosen=in_front(found.chosen, by_path.y))
 
-    def _apply(
-        self,
-        estimate: Estimate,
-        H: Floats,
-        y: Floats,
-        noise: Floats,
-        *,
-        lasting: Floats | None = None,
-        teaches: bool = False,
-    ) -> float:
-        error, chi2 = told_by(estimate, H, y - H @ self._off, noise, lasting=lasting, teaches=teaches)
+    def _apply(self, estimate: Estimate, H: Floats, y: Floats, noise: Floats) -> None:
+        error, _ = told_by(estimate, H, y - H @ self._off, noise)
         self._off = self._off + error
-        return chi2
 
 
 def settled(

@@ -231,9 +231,10 @@ class TrackSights(TrackMoves):
         """Update an estimate by a picture's lights; return them with the variances that they counted with."""
         used = counted(found.chosen, sight, estimate)
         rows_H, rows_y, noise = light_rows(found.chosen, y, H)
-        beside = lasting(found.chosen, used)
-        chi2 = self._apply(estimate, rows_H, rows_y, noise, lasting=beside, teaches=True)
-        estimate.lasted += int(np.count_nonzero(beside))
+        more = counted_more(found.chosen, used)
+        error, chi2 = told_by(estimate, rows_H, rows_y, noise, more, teaches=True)
+        estimate.state = estimate.state.plus(error)
+        estimate.lasted += int(np.count_nonzero(more))
         note_lit(estimate, sight, used)
         estimate.surprise += chi2
         estimate.told += len(rows_y)
@@ -241,19 +242,10 @@ class TrackSights(TrackMoves):
         estimate.trigger += [(sight.t_s, sight.node, light) for _, light, _ in found.chosen]
         return used
 
-    def _apply(
-        self,
-        estimate: Estimate,
-        H: Floats,
-        y: Floats,
-        noise: Floats,
-        *,
-        lasting: Floats | None = None,
-        teaches: bool = False,
-    ) -> float:
-        error, chi2 = told_by(estimate, H, y, noise, lasting=lasting, teaches=teaches)
+    def _apply(self, estimate: Estimate, H: Floats, y: Floats, noise: Floats) -> None:
+        """Update an estimate by what is no light."""
+        error, _ = told_by(estimate, H, y, noise)
         estimate.state = estimate.state.plus(error)
-        return chi2
 
 
 def told_by(
@@ -261,21 +253,21 @@ def told_by(
     H: Floats,
     y: Floats,
     noise: Floats,
+    more: Floats | None = None,
     *,
-    lasting: Floats | None = None,
-    teaches: bool,
+    teaches: bool = False,
     others: int = 0,
 ) -> tuple[Floats, float]:
     """Update all but an estimate's state; give the error (SIZE,) to add to that, and chi^2 of the residuals y (m,).
 
-    lasting (m,): by how much variances count more than they are, in all but chi^2. teaches: whether shaking and shares
+    more (m,): by how much variances count more than they are, in all but chi^2. teaches: whether shaking and shares
     learn. others: how many rows, the first ones, are not of lights.
     """
     before = estimate.covariance
-    if lasting is None or not lasting.any():
+    if more is None or not more.any():
         error, estimate.covariance, chi2, S_inverse, gain = anchors.kalman(before, H, y, noise)
     else:
-        error, estimate.covariance, _, S_inverse, gain = anchors.kalman(before, H, y, noise + np.diag(lasting))
+        error, estimate.covariance, _, S_inverse, gain = anchors.kalman(before, H, y, noise + np.diag(more))
         chi2 = float(y @ np.linalg.solve(H @ before @ H.T + noise, y))
     if estimate.learns and estimate.by_shares.any():
         moved = H @ estimate.by_shares
@@ -331,14 +323,13 @@ def counted(chosen: Chosen, sight: Sight, estimate: Estimate) -> Chosen:
     return tuple((k, light, variance * alike(lasting_s[k], apart_s[light])) for k, light, variance in chosen)
 
 
-def lasting(chosen: Chosen, used: Chosen) -> Floats:
+def counted_more(chosen: Chosen, used: Chosen) -> Floats:
     """Give by how much the variances of lights (2 N,) count more than they are."""
-    more = [counts - variance for (_, _, variance), (_, _, counts) in zip(chosen, used, strict=True)]
-    return np.repeat(more, 2)
+    return np.repeat([counts - variance for (*_, variance), (*_, counts) in zip(chosen, used, strict=True)], 2)
 
 
 def note_lit(estimate: Estimate, sight: Sight, used: Chosen) -> None:
-    """Note when the lights that were used were."""
+    """Note when lights were used."""
     for _, light, _ in used:
         estimate.lit_s[sight.node, light] = sight.t_s
 

@@ -64,8 +64,8 @@ def test_what_shaking_adds_to_the_covariance_stays_a_part_of_it(monkeypatch: pyt
     """Depths beside lights once made it grow without end: a dive of seven minutes lost its track."""
     shares: list[float] = []
 
-    def told_by(estimate: Estimate, H: Floats, y: Floats, noise: Floats, **options: Any) -> tuple[Floats, float]:
-        told = seeing.told_by(estimate, H, y, noise, **options)
+    def told_by(estimate: Estimate, *measured: Floats, **options: Any) -> tuple[Floats, float]:
+        told = seeing.told_by(estimate, *measured, **options)
         shaken = np.diagonal(estimate.shaken, axis1=1, axis2=2)
         shares.append(float((shaken / np.diag(estimate.covariance)[:MOVING]).max()))
         return told
