@@ -25,6 +25,9 @@ from buddyline.solver_service.geometry.sensors import Sensors, off_rad, turn_of
 # One light in ten quadruples stands off by a gross error, five times its noise.
 GROSS_PROBABILITY: Final = 0.1
 GROSS_SCALE: Final = 5.0
+# Share of lights found wrongly by many pixels (flares, half-hidden lights), and how far, 1 sd.
+GROSS_SHARE: Final = 0.03
+GROSS_PX: Final = 7.0
 # Log densities of no, one and two gaps at zero: of their noise, and of gross errors.
 _LOG_USUAL: Final = math.log(1.0 - GROSS_PROBABILITY)
 _LOG_GROSS: Final = [math.log(GROSS_PROBABILITY / GROSS_SCALE**gaps) for gaps in range(3)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
@@ -32,7 +32,7 @@ class Solved:
     """The least squares of K poses: steps (K, 6) to take, covariance (K, 6, 6) of T_a_b.retract, chi2 (K,) after it.
 
     lost: (K,) by how much the step lowers chi^2. open: (K, 6) how much worse each coordinate is known beside the others
-    than alone (variances).
+    than alone (variances). log_noise: (K,) half the log determinant of the residuals' covariance.
     """
 
     step: Floats
@@ -40,10 +40,11 @@ class Solved:
     chi2: Floats
     lost: Floats
     open: Floats
+    log_noise: Floats
 
     def __getitem__(self, index: Index) -> Solved:
         """Choose some."""
-        return Solved(self.step[index], self.covariance[index], self.chi2[index], self.lost[index], self.open[index])
+        return Solved(*(getattr(self, each.name)[index] for each in fields(self)))
 
 
 @dataclass(eq=False, slots=True)
@@ -100,7 +101,8 @@ def least_squares(rows: Floats, covariance: Floats | None = None) -> Solved:
     back = of_step @ g
     lost = (back.swapaxes(1, 2) @ g)[:, 0, 0]
     chi2 = np.maximum(normal[:, 6, 6] - lost, 0.0)
-    return Solved(-back[:, :, 0], of_step, chi2, lost, of_step.diagonal(0, 1, 2) * H.diagonal(0, 1, 2))
+    log_noise = np.zeros(len(rows)) if covariance is None else 0.5 * np.asarray(np.linalg.slogdet(covariance)[1])
+    return Solved(-back[:, :, 0], of_step, chi2, lost, of_step.diagonal(0, 1, 2) * H.diagonal(0, 1, 2), log_noise)
 
 
 def _is_large(solved: Solved, t: Floats) -> NDArray[np.bool_]:

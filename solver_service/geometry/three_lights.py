@@ -15,7 +15,9 @@ from buddyline.solver_service.geometry.batch import Batch
 from buddyline.solver_service.geometry.evidence import (
     DEPTH_SPREAD_M,
     GROSS_PROBABILITY,
+    GROSS_PX,
     GROSS_SCALE,
+    GROSS_SHARE,
     HEADING_SPREAD,
     MISSING_ODDS,
     PITCH_SPREAD,
@@ -92,7 +94,7 @@ def read_three_lights(batch: Batch, wanted: NDArray[np.bool_]) -> Read:
 
 def log_fit(solved: Solved) -> Floats:
     """Give the residuals' part (K,) of the log likelihood ratio, by Laplace's approximation about the pose."""
-    fit: Floats = 0.5 * np.log(np.linalg.det(solved.covariance)) - 0.5 * solved.chi2
+    fit: Floats = 0.5 * np.log(np.linalg.det(solved.covariance)) - 0.5 * solved.chi2 - solved.log_noise
     return fit
 
 
@@ -181,6 +183,7 @@ def _log_ratio(
         total += np.where(lights < 0, 0.0, seen.log_side[lights, _SIDES]).sum(1)
         # A lamp that is switched off is missing for certain.
         total -= math.log(MISSING_ODDS) * ((lights < 0) & seen.dark[trigger]).sum(1)
+    total += np.log1p(_gross_odds(batch, guesses, T_a_b))
     R_ned_a, R_ned_b = sensors.R_ned_camera[trigger].swapaxes(0, 1)
     turn = turn_of(T_a_b.R, R_ned_a, R_ned_b)
     u = T_a_b.t_m / range_m[:, None]
@@ -193,6 +196,36 @@ def _log_ratio(
     density /= HEADING_SPREAD * np.sqrt(2.0 * math.pi * tilt_variance)
     lone_odds = MISSING_ODDS * _others_per_sr(batch, guesses) / density
     return total + heading, turn, heading, turn_variance, lone_odds
+
+
+def _gross_odds(batch: Batch, guesses: Guesses, T_a_b: SE3) -> Floats:
+    """Give the odds (K,) that the fourth light is among the candidates, off by a gross error, against that it is not.
+
+    Where four lights do not fit for the sake of one, the other three would otherwise have to call it chance that a
+    candidate stands beside its place, and would lose to three lights of another pose.
+    """
+    seen, rigs, lights = batch.candidates, batch.rigs, guesses.lights
+    missing = lights.argmin(1)
+    in_b = missing >> 1
+    light_m = rigs.lights_in_camera_m[1 - in_b, missing & 1]
+    back_again = T_a_b.inverse()
+    R = np.where(in_b[:, None, None], back_again.R, T_a_b.R)
+    t = np.where(in_b[:, None], back_again.t_m, T_a_b.t_m)
+    foretold = (R @ light_m[:, :, None])[:, :, 0] + t
+    picture = 2 * guesses.trigger + in_b
+    owner, place = places(seen.counts.ravel()[picture])
+    other = seen.starts[picture][owner] + place
+    along, *across = np.moveaxis((seen.frames[other] @ foretold[owner, :, None])[:, :, 0], 1, 0)
+    off = np.array(across) / along * seen.sigma_px[other]
+    fits = np.exp(seen.log_score[other] - 0.5 * (off * off).sum(0) / GROSS_PX**2)
+    if seen.log_side is not None:
+        fits *= np.exp(seen.log_side[other, _SIDES[missing[owner]]])
+    # The third light, in the same picture, is no second one; nor is a light that stands behind the camera.
+    fits[(other == lights.max(1, where=np.arange(4) // 2 == in_b[:, None], initial=-1)[owner]) | (along <= 0.0)] = 0.0
+    chance = seen.in_whole[guesses.trigger, in_b] / rigs.area_px2[in_b]
+    found = np.bincount(owner, fits, minlength=len(lights))
+    odds: Floats = GROSS_SHARE / MISSING_ODDS * found / (2.0 * math.pi * GROSS_PX**2 * chance)
+    return odds
 
 
 def _others_per_sr(batch: Batch, guesses: Guesses) -> Floats:

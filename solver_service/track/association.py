@@ -9,6 +9,7 @@ from itertools import chain, islice
 from typing import Final, TypeAlias
 
 import numpy as np
+from buddyline.solver_service.geometry.evidence import GROSS_PX, GROSS_SHARE
 from buddyline.solver_service.geometry.rotation import Floats
 from numpy.typing import NDArray
 
@@ -16,9 +17,6 @@ from numpy.typing import NDArray
 # doubt in its variance.
 SURE: Final = 0.99
 LIKELY: Final = 0.8
-# Share of lights found wrongly by many pixels (flares, half-hidden lights), and how far, 1 sd.
-GROSS_SHARE: Final = 0.03
-GROSS_PX: Final = 7.0
 # Beyond this chi^2 (2 degrees of freedom) an assignment is not weighed: a chance of 1e-6.
 GATE: Final = 27.6
 MAX_OPTIONS: Final = 10

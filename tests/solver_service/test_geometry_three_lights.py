@@ -4,9 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from buddyline.solver_service.geometry.batch import Batch
+from buddyline.solver_service.geometry.evidence import GROSS_PX, GROSS_SHARE, MISSING_ODDS
+from buddyline.solver_service.geometry.four_lights import read_four_lights
+from buddyline.solver_service.geometry.observation import Observation
+from buddyline.solver_service.geometry.past import Past
 from buddyline.solver_service.geometry.rotation import rotation_exp
 from buddyline.solver_service.geometry.se3 import SE3
+from buddyline.solver_service.geometry.three_lights import read_three_lights
 from buddyline.solver_service.geometry.trigger import Fix, NoFix, Prior, Sensed, Settings
+from buddyline.solver_service.geometry.weighing import weigh_readings
 
 from tests.solver_service.scenes import IDEAL, ODD_A, ODD_B, PairScene, random_scene, solve_trigger, view
 
@@ -31,6 +38,15 @@ def followed(scene, rng, sigma=(0.1, 0.05)):
     off = sigma * rng.standard_normal(6)
     R = rotation_exp(off[3:]) @ scene.R
     return Prior(SE3(R, scene.t + off[:3]), np.diag(sigma**2))
+
+
+def log_ratio(views, scene, sensed, *, three):
+    """Give the best log ratio of three or of four lights, without a past."""
+    batch = Batch.of([Observation(*views, *sensed)], (scene.rig_a, scene.rig_b), SETTINGS)
+    past = Past.of(None, None, batch.candidates.variance_of(0), batch.rigs, SETTINGS)
+    with np.errstate(all="ignore"):
+        read = read_three_lights(batch, np.ones(1, dtype=bool)) if three else read_four_lights(batch).read
+        return weigh_readings(read, 0, past, SETTINGS, three=three).log_ratio.max()
 
 
 def error(fix, scene):
@@ -150,6 +166,40 @@ def test_another_lamp_does_not_pass_for_a_light_whose_node_is_not_in_view():
             sensed = scene.sensed(rng)
             assert isinstance(solve(scene, views, sensed), NoFix)
             assert isinstance(solve(scene, views, sensed, prior=followed(scene, rng)), NoFix)
+
+
+@pytest.mark.parametrize("sigma_px", [0.01, 0.1, 1.0])
+def test_four_lights_that_fit_are_likelier_than_any_three_of_them(sigma_px):
+    """However sharp the pictures are: the stamps' error moves all lights of one, and weighs both alike.
+
+    With the lights' own noise alone, three sharp ones counted as likelier than four.
+    """
+    rng = np.random.default_rng(9)
+    for _ in range(20):
+        scene = random_scene(rng, (2.0, 6.0))
+        seen = [v for v, _ in scene.views(rng, sigma_px)], scene, scene.sensed(rng)
+        four, three = log_ratio(*seen, three=False), log_ratio(*seen, three=True)
+        # The fourth stands by chance in its place: within some 10 px^2 of 2 million, for want of any one in five.
+        assert four > three + 3.0
+
+
+@pytest.mark.parametrize("missing", range(4))
+def test_a_candidate_beside_the_fourth_lights_place_speaks_for_the_three(missing):
+    """It may be that light, off by a gross error, and need not stand there by chance."""
+    rng = np.random.default_rng(10 + missing)
+    node, light = divmod(missing, 2)
+    for _ in range(10):
+        scene = random_scene(rng, (2.0, 4.0))
+        views = without(scene, missing, rng, 0.05)
+        place = (scene.clear_a, scene.clear_b)[node][light]
+        found = []
+        for off_px in (np.array((0.0, 4.0)), np.array((0.0, 80.0))):
+            pixels = views[node].pixels, [place + off_px]
+            both = [view(np.concatenate(pixels), 0.05) if k == node else views[k] for k in (0, 1)]
+            found.append(log_ratio(both, scene, scene.sensed(), three=True))
+        density = np.exp(-0.5 * (4.0 / GROSS_PX) ** 2) / (2.0 * np.pi * GROSS_PX**2)
+        odds = GROSS_SHARE / MISSING_ODDS * density * (1640 * 1232) / 2
+        assert found[0] - found[1] == pytest.approx(np.log1p(odds), abs=0.3)
 
 
 def test_two_lights_are_no_pose():
