@@ -162,6 +162,7 @@ def _readings(
         twist_gap_rad=solved.twist_gap_rad[best],
         clutter=clutter if batch.settings.gaps == 2 else np.zeros(len(best)),
         lone_odds=np.zeros(len(best)),
+        lone_density=np.zeros(len(best)),
     )
 
 

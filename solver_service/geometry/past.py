@@ -13,7 +13,7 @@ import numpy as np
 from buddyline.solver_service.geometry.evidence import weigh_heading
 from buddyline.solver_service.geometry.observation import Heading, Prior, Settings
 from buddyline.solver_service.geometry.rig import RigPair
-from buddyline.solver_service.geometry.rotation import Floats, inner, skew
+from buddyline.solver_service.geometry.rotation import Floats, Indices, inner, skew
 from buddyline.solver_service.geometry.se3 import SE3
 from buddyline.solver_service.geometry.sensors import off_rad
 
@@ -31,6 +31,8 @@ _MAX_LOG_PRIOR: Final = 7.0
 _REACH_MPS: Final = 2.0
 _REACH_RADPS: Final = 3.0
 _MOST_AGREED: Final = 5
+# So large a variance, in units of the noise, leaves nothing of a residual.
+_UNTOLD: Final = 1e12
 # A matrix (9,) times this: half its antisymmetric part as a vector, and its trace.
 _SINES_AND_TRACE: Final = np.column_stack((0.5 * skew(np.eye(3)).reshape(3, 9).T, np.eye(3).ravel()))
 
@@ -104,14 +106,43 @@ class Prediction:
         three: whether they are of three lights. Then all_wrong does not count: no gap checks such a pose, and rivals
         out of reach show how far chance may go.
         """
-        # Of the turn from there: the sine about each axis, and the trace; half a turn away the sine is short again.
-        turned = (T_a_b.R @ self.T_a_b.R.T).reshape(-1, 9) @ _SINES_AND_TRACE
-        off = np.concatenate((T_a_b.t_m - self.T_a_b.t_m, turned[:, :3]), axis=1)
-        chi2 = np.where(turned[:, 3] > 1.0, inner(off @ self.information, off), np.inf)
+        off, trace = self._off(T_a_b)
+        chi2 = np.where(trace > 1.0, inner(off @ self.information, off), np.inf)
         in_reach = inner(off[:, :3], off[:, :3]) < self.reach_m**2
         wrong = np.where(in_reach | three, _PRIOR_WRONG, self.all_wrong)
         gain: Floats = np.log(wrong + (1.0 - _PRIOR_WRONG) * np.exp(self.log_gain - 0.5 * chi2))
         return gain
+
+    def weigh_lone(self, T_a_b: SE3, rows: Floats, noise: Floats | None, lone: Indices, density: Floats) -> Floats:
+        """Give what the prediction adds (log) to the density of the only light of a node, K poses of three lights.
+
+        That the other node's two lights agree with the prediction says nothing of it. rows: (K, n, 7) at T_a_b, of
+        lights and sensors, noise (K, n, n) of them. lone: (K, 2) its rows. density: (K,) of it by the other rows and
+        the headings, at its residuals.
+        """
+        k, n = np.arange(len(rows))[:, None], rows.shape[1]
+        N = np.tile(np.eye(n), (len(rows), 1, 1)) if noise is None else noise.copy()
+        own = N[k[..., None], lone[:, :, None], lone[:, None]]
+        # Nothing is foretold by the light itself.
+        N[k, lone, lone] += _UNTOLD
+        J, r = rows[:, :, :6], rows[:, :, 6:]
+        weighted = J.swapaxes(1, 2) @ np.linalg.inv(N)
+        covariance = np.linalg.inv(weighted @ J + self.information)
+        step = -covariance @ (weighted @ r + self.information @ self._off(T_a_b)[0][:, :, None])
+        J, r = J[k, lone], r[k, lone]
+        left, spread = r + J @ step, own + J @ covariance @ J.swapaxes(1, 2)
+        chi2 = (left.swapaxes(1, 2) @ np.linalg.solve(spread, left))[:, 0, 0]
+        foretold = np.exp(-0.5 * chi2) / (2.0 * math.pi * np.sqrt(np.linalg.det(spread)))
+        gain: Floats = np.log(_PRIOR_WRONG + (1.0 - _PRIOR_WRONG) * foretold / density)
+        return gain
+
+    def _off(self, T_a_b: SE3) -> tuple[Floats, Floats]:
+        """Give how far K poses are from the prediction, and the trace of the turn from there.
+
+        (K, 6) m and the sines about each axis; half a turn away the sine is short again.
+        """
+        turned = (T_a_b.R @ self.T_a_b.R.T).reshape(-1, 9) @ _SINES_AND_TRACE
+        return np.concatenate((T_a_b.t_m - self.T_a_b.t_m, turned[:, :3]), axis=1), turned[:, 3]
 
 
 @dataclass(eq=False, slots=True)
@@ -139,6 +170,12 @@ class Past:
     def weigh(self, T_a_b: SE3, *, three: bool) -> Floats:
         """Weigh K poses between the cameras' frames by the prediction; three: whether they are of three lights."""
         return np.zeros(len(T_a_b)) if self.prediction is None else self.prediction.weigh(T_a_b, three=three)
+
+    def weigh_lone(self, T_a_b: SE3, rows: Floats, noise: Floats | None, lone: Indices, density: Floats) -> Floats:
+        """Weigh the only lights of a node by the prediction, as it does."""
+        if self.prediction is None:
+            return np.zeros(len(T_a_b))
+        return self.prediction.weigh_lone(T_a_b, rows, noise, lone, density)
 
     def weigh_heading(self, turn: Floats, log_heading: Floats, variance: Floats) -> Floats:
         """Give what the learned heading adds (K,), in place of the sensors' own word of their headings, log_heading.

@@ -33,7 +33,8 @@ class Readings:
     sensors. gap_chi2: (M,) of the gaps that may speak, by the closed form. range_m: (M, 2) by A's bar and by B's,
     twist_gap_rad (M,); both by the closed form. clutter: (M,) candidates that chance puts into the variance of the
     lights' positions; 0 for three lights and where a gap may not speak. lone_odds: (M,) that the only light of a node
-    is another lamp, without the past; 0 where both are seen.
+    is another lamp, without the past; lone_density: (M,) of its place by the other three and the sensors, per square of
+    its sigma. Both are 0 where both are seen.
     """
 
     lights: Indices
@@ -47,6 +48,7 @@ class Readings:
     twist_gap_rad: Floats
     clutter: Floats
     lone_odds: Floats
+    lone_density: Floats
 
 
 @dataclass(eq=False, slots=True)

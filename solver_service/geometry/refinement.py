@@ -144,8 +144,8 @@ def light_rows(T_a_b: SE3, frames: Floats, lights_m: Floats) -> tuple[Floats, Fl
     return rows.reshape(-1, 8, 7), depth[:, :, 0, 0]
 
 
-def at_one_instant(rows: Floats, dt_s: Floats, skew_sign: Floats, motion: Motion) -> Solved:
-    """Solve again for what is known of the motion between the sightings, by the same linearization.
+def at_one_instant(rows: Floats, dt_s: Floats, skew_sign: Floats, motion: Motion) -> tuple[Floats, Floats]:
+    """Give rows again, and the covariance (K, n, n) of residuals, for what is known of the motion between sightings.
 
     dt_s: (K, n) of each residual. skew_sign: (n,) which way half of the clocks' disagreement moves it in time: 1 in A's
     picture, -1 in B's, 0 in none. The residuals of a picture share the error of its stamp.
@@ -161,4 +161,4 @@ def at_one_instant(rows: Floats, dt_s: Floats, skew_sign: Floats, motion: Motion
     total += _UNIT_NOISE[: rows.shape[1], : rows.shape[1]]
     shifted = rows.copy()
     shifted[:, :, 6] += by_rate @ motion.rates
-    return least_squares(shifted, total)
+    return shifted, total

@@ -61,7 +61,7 @@ def read_three_lights(batch: Batch, wanted: NDArray[np.bool_]) -> Read:
     range2 = inner(T_a_b.t_m, T_a_b.t_m)
     sound = refined.sound & (refined.solved.chi2 < _FITS_CHI2)
     sound &= (range2 > settings.range_min_m**2) & (range2 < settings.range_max_m**2)
-    log_ratio, turn, log_heading, turn_variance, lone_odds = _log_ratio(batch, guesses, across, T_a_b, refined)
+    log_ratio, turn, log_heading, turn_variance, *lone = _log_ratio(batch, guesses, across, T_a_b, refined)
     sound &= np.isfinite(refined.solved.covariance.sum((1, 2)) + log_ratio)
     none, range_m = np.zeros(len(trigger)), np.sqrt(range2)
     starts = starts_of(np.bincount(trigger, minlength=batch.triggers))
@@ -87,7 +87,8 @@ def read_three_lights(batch: Batch, wanted: NDArray[np.bool_]) -> Read:
             range_m=np.stack((range_m, range_m), axis=1),
             twist_gap_rad=none,
             clutter=none,
-            lone_odds=lone_odds,
+            lone_odds=lone[0],
+            lone_density=lone[1],
         ),
     )
 
@@ -156,11 +157,11 @@ def _across(down: Floats) -> Floats:
 
 def _log_ratio(
     batch: Batch, guesses: Guesses, across: Floats, T_a_b: SE3, refined: Refined
-) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
     """Give the log likelihood ratio against chance (K,), without the fit.
 
-    After it turn, log_heading and turn_variance as in Poses, and lone_odds as in Readings. across: as `_sensor_rows`
-    takes it.
+    After it turn, log_heading and turn_variance as in Poses, and lone_odds and lone_density as in Readings. across: as
+    `_sensor_rows` takes it.
     """
     settings, seen, rigs, sensors = batch.settings, batch.candidates, batch.rigs, batch.sensors
     trigger, lights = guesses.trigger, guesses.lights
@@ -194,8 +195,9 @@ def _log_ratio(
     tilt_variance = sensors.tilts_variance[trigger]
     density = np.exp(heading - 0.5 * rise * rise / tilt_variance)
     density /= HEADING_SPREAD * np.sqrt(2.0 * math.pi * tilt_variance)
-    lone_odds = MISSING_ODDS * _others_per_sr(batch, guesses) / density
-    return total + heading, turn, heading, turn_variance, lone_odds
+    lone, others_per_sr = _others_per_sr(batch, guesses)
+    lone_odds, lone_density = MISSING_ODDS * others_per_sr / density, density * seen.variance[lone]
+    return total + heading, turn, heading, turn_variance, lone_odds, lone_density
 
 
 def _gross_odds(batch: Batch, guesses: Guesses, T_a_b: SE3) -> Floats:
@@ -228,8 +230,11 @@ def _gross_odds(batch: Batch, guesses: Guesses, T_a_b: SE3) -> Floats:
     return odds
 
 
-def _others_per_sr(batch: Batch, guesses: Guesses) -> Floats:
-    """Give how many candidates per sr of the lone light's picture look as much like a light; it counts as one."""
+def _others_per_sr(batch: Batch, guesses: Guesses) -> tuple[Indices, Floats]:
+    """Give the lone lights (K,), and how many candidates per sr of their pictures look as much like a light.
+
+    Each counts as one.
+    """
     seen = batch.candidates
     seen_in = guesses.lights.reshape(-1, 2, 2)
     node = (seen_in >= 0).all(2).argmin(1)
@@ -237,5 +242,4 @@ def _others_per_sr(batch: Batch, guesses: Guesses) -> Floats:
     owner, place = places(seen.counts[guesses.trigger, node])
     other = seen.starts[seen.image[lone]][owner] + place
     alike = np.minimum(np.exp(2.0 * (seen.log_score[other] - seen.log_score[lone[owner]])), 1.0)
-    density: Floats = np.bincount(owner, alike, minlength=len(node)) / batch.rigs.solid_angle_sr[node]
-    return density
+    return lone, np.bincount(owner, alike, minlength=len(node)) / batch.rigs.solid_angle_sr[node]

@@ -56,9 +56,12 @@ __all__ = [
 _SAME_POSITION: Final = 0.04
 _SAME_TRACE: Final = 1.0 + 2.0 * math.cos(0.1)
 # Three lights have no gap to check them, and the headings tell no better than this which of two lights a node sees.
-# They must be likelier where the motion prior decides for or against them: it knows nothing of how a diver turns aside.
+# They must be likelier where the motion prior decides for or against them, and more so than any other hypothesis: it
+# knows nothing of how a diver turns aside. In 210 simulated dives of half a minute none of 11,380 poses of three lights
+# is wrong; with 0.995 against the others, too, 2 of 11,622 are, and with 0.98 against a false light 3 of 11,587.
 _THREE_PROBABILITY: Final = 0.98
-_FOLLOWED_PROBABILITY: Final = 0.999
+_FOLLOWED_PROBABILITY: Final = 0.99
+_UNRIVALLED_PROBABILITY: Final = 0.999
 # Four lights that no earlier pose supports, where both attitudes are known. In 64 dives among strangers' lamps 0.997
 # gave as many wrong poses (7 of 4,672 triggers), and it costs whole rests their poses.
 _ALONE_PROBABILITY: Final = 0.99
@@ -176,18 +179,19 @@ class _Batched:
         unsure = sigma_m > _SURE_POSITION * range_m
         if short and unsure:
             return NoFix("ambiguous", f"three lights give {in_metres(range_m)} to {sigma_m:.2g} m only")
-        # A false candidate in a light's place is off by as much as the covariance has been widened for.
-        false_light = ratio * float(readings.lone_odds[place]) * math.exp(-float(weighed.log_past[k]))
-        # What is widened for a gross error may as well be wrong by more: the lights do not fit each other.
-        if unsure or widened > 1.0:
-            false_light = ratio * math.exp(weighed.log_false[k])
+        # A false candidate in a light's place is off by as much as the covariance has been widened for. What is widened
+        # for a gross error may as well be wrong by more: the lights do not fit each other.
+        false_light = ratio * math.exp(weighed.log_false[k]) if short or unsure or widened > 1.0 else 0.0
         probability = agreeing / (CHANCE_ODDS + agreeing + others + false_light)
         oriented = self.oriented[trigger] and "attitude" in settings.checks
         required = settings.min_oriented_probability if oriented else settings.min_probability
         if oriented and weighed.log_prior[k] <= 0.0:
             required = max(required, _ALONE_PROBABILITY)
         if short:
-            required = _FOLLOWED_PROBABILITY if weighed.log_prior[k] != 0.0 else _THREE_PROBABILITY
+            required = _THREE_PROBABILITY
+            if weighed.log_prior[k] != 0.0:
+                alone = agreeing / (CHANCE_ODDS + agreeing + others) >= _UNRIVALLED_PROBABILITY
+                required = _FOLLOWED_PROBABILITY if alone else _UNRIVALLED_PROBABILITY
         if probability >= required:
             covariance = widened * _spread(weighed, k, same)
             against = self._against_headings(trigger, weighed, k, covariance, learned)

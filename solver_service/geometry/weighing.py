@@ -11,7 +11,7 @@ from buddyline.solver_service.geometry.evidence import UNFIT_CHI2, log_false_lig
 from buddyline.solver_service.geometry.observation import Settings
 from buddyline.solver_service.geometry.past import Past
 from buddyline.solver_service.geometry.readings import Read, Readings
-from buddyline.solver_service.geometry.refinement import Solved, at_one_instant
+from buddyline.solver_service.geometry.refinement import at_one_instant, least_squares
 from buddyline.solver_service.geometry.rotation import Floats, Indices
 from buddyline.solver_service.geometry.se3 import SE3
 from buddyline.solver_service.geometry.three_lights import UNCHECKED, log_fit
@@ -29,8 +29,9 @@ class Weighed:
 
     covariance (M, 6, 6), chi2 (M,). log_ratio: (M,) against chance, -inf where the pose is not sound, or its four
     lights do not fit. log_prior: (M,) the prediction's part in it, log_past (M,) all that the past says. log_false:
-    (M,) log odds that a false candidate stands in for one of four lights. others: the sum of the likelihood ratios of
-    all that is not here. sources: the readings that each is one of, and its place there.
+    (M,) log odds that a false candidate stands in for one of four lights, or for the only light of a node. others: the
+    sum of the likelihood ratios of all that is not here. sources: the readings that each is one of, and its place
+    there.
     """
 
     T_a_b: SE3
@@ -98,17 +99,23 @@ def weigh_readings(read: Read, trigger: int, past: Past, settings: Settings, *, 
         others = float(ratios.sum())
     log_prior, log_past = log_prior[pose], log_past[pose]
     readings = read.readings
-    solved = _solve(readings, place, past)
+    rows, noise = _rows(readings, place, past)
+    solved = readings.refined.solved[place] if noise is None else least_squares(rows, noise)
     chi2, covariance = solved.chi2, solved.covariance
     sound = readings.refined.sound[place]
     if three:
         fit = log_fit(solved)
         covariance = UNCHECKED * covariance
+        foretold = past.weigh_lone(
+            readings.refined.T_a_b[place], rows, noise, _lone(readings.lights[place]), readings.lone_density[place]
+        )
+        log_false = np.log(readings.lone_odds[place]) - foretold - (log_past - log_prior)
     else:
         # Without both gaps the picture's chi2 would bring in what the settings leave out.
         chi2 = chi2 if settings.gaps == 2 else readings.gap_chi2[place]
         fit = log_gaps(chi2, settings.gaps)
         sound = sound & (chi2 < UNFIT_CHI2)
+        log_false = log_false_light(fit, readings.clutter[place])
     log_ratio = readings.log_ratio[place] + fit + log_past
     log_ratio[~(sound & np.isfinite(log_ratio))] = -np.inf
     return Weighed(
@@ -118,7 +125,7 @@ def weigh_readings(read: Read, trigger: int, past: Past, settings: Settings, *, 
         log_ratio=log_ratio,
         log_prior=log_prior,
         log_past=log_past,
-        log_false=log_false_light(fit, readings.clutter[place]),
+        log_false=log_false,
         others=others,
         sources=[(readings, k) for k in place.tolist()],
     )
@@ -138,10 +145,16 @@ def _likeliest(log_ratio: Floats, read_at: Indices) -> Indices:
     return chosen
 
 
-def _solve(readings: Readings, place: Indices, past: Past) -> Solved:
-    """Take the last step, for what is known of the motion."""
-    dt_s = readings.dt_s[place]
+def _rows(readings: Readings, place: Indices, past: Past) -> tuple[Floats, Floats | None]:
+    """Give the readings' rows and their residuals' covariance, for what is known of the motion; None: of unit noise."""
+    rows, dt_s = readings.refined.rows[place], readings.dt_s[place]
     if past.settings.still and not dt_s.any():
-        return readings.refined.solved[place]
-    rows = readings.refined.rows[place]
+        return rows, None
     return at_one_instant(rows, dt_s, _SKEW_SIGN[: rows.shape[1]], past.motion)
+
+
+def _lone(lights: Indices) -> Indices:
+    """Give the two rows (M, 2) of the light whose bar's other one is not among lights (M, 4)."""
+    missing = lights.argmin(1)
+    rows: Indices = 2 * (missing ^ 1)[:, None] + np.arange(2)
+    return rows

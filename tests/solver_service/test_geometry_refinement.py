@@ -7,7 +7,7 @@ import pytest
 from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.four_lights import refine_lights
 from buddyline.solver_service.geometry.past import Motion
-from buddyline.solver_service.geometry.refinement import at_one_instant
+from buddyline.solver_service.geometry.refinement import at_one_instant, least_squares
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import rotation_exp
 from buddyline.solver_service.geometry.se3 import SE3
@@ -40,7 +40,7 @@ def refine(T_a_b, frames, rig_a, rig_b, motion=STILL, dt_s=(0.0, 0.0, 0.0, 0.0))
     """Refine by the pictures alone, then bring all sightings to one instant."""
     found = refine_lights(T_a_b, frames, np.array((rig_a.lights_m, rig_b.lights_m)))
     times_s = np.tile(np.repeat(dt_s, 2), (len(frames), 1))
-    solved = at_one_instant(found.rows, times_s, np.repeat((1.0, -1.0), 4), motion)
+    solved = least_squares(*at_one_instant(found.rows, times_s, np.repeat((1.0, -1.0), 4), motion))
     return RefinedPoses(found.T_a_b.retract(solved.step), solved.covariance, solved.chi2, found.sound)
 
 
@@ -194,7 +194,7 @@ def test_of_an_unknown_motion_too_each_picture_alone_has_the_error_of_its_stamp(
     for picture in (1.0, -1.0):
         moved = 0.7 * J * (pictures == picture)[:, None]
         noise += moved @ (motion.covariance + np.outer(RATES, RATES)) @ moved.T
-    solved = at_one_instant(rows, np.zeros((1, 11)), pictures, motion)
+    solved = least_squares(*at_one_instant(rows, np.zeros((1, 11)), pictures, motion))
     np.testing.assert_allclose(solved.covariance[0], np.linalg.inv(J.T @ np.linalg.solve(noise, J)), rtol=1e-9)
 
 

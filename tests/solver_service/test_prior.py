@@ -65,6 +65,28 @@ def test_predictions_cover_what_comes():
     assert np.quantile(errors, 0.99) < 16.8
 
 
+@pytest.mark.parametrize("pictures", [1, 5, 10])
+def test_predictions_cover_the_turns_of_a_diver_who_looks_at_another_far_away(pictures):
+    """B stands still; in A's frame it swings, the further away the faster. Not seen for so many pictures of 50."""
+    covariance, back = np.diag([0.002, 0.002, 0.01, 0.004, 0.004, 0.002]) ** 2, rotation_exp(np.array([0.0, 3.1, 0.0]))
+    for range_m in (2.0, 6.0, 12.0):
+        rng, prior, errors = np.random.default_rng(6), PosePrior(), []
+        for k in range(1000):
+            s = k * 0.1
+            turn = rotation_exp(np.array([0.05 * np.sin(1.3 * s), 0.15 * np.sin(1.1 * s) + 0.1 * np.sin(0.4 * s), 0.0]))
+            t, R = turn @ np.array([0.0, 0.0, range_m]), turn @ back
+            if k % 50 == 50 - pictures:
+                predicted = prior.predict((k + pictures - 1) * STEP_NS)
+            if k % 50 == 49:
+                off = SE3(R, t).minus(predicted.T_a_b)
+                errors.append(off @ np.linalg.solve(predicted.covariance, off))
+            if k % 50 < 50 - pictures:
+                off = rng.normal(size=6) * np.sqrt(np.diag(covariance))
+                prior.update(k * STEP_NS, fix(t + off[:3], rotation_exp(off[3:]) @ R, covariance))
+        assert np.mean(errors) < 6.0
+        assert max(errors) < 16.8
+
+
 def test_velocity_is_followed():
     prior = PosePrior()
     for stamp_ns, _, _, seen in moving(5, np.random.default_rng(2), noise=0.0):
