@@ -31,7 +31,8 @@ class Estimate:
     would be moved by a share of 1 of the samples' fast parts; shares: what the lights tell of them (vibration.py).
     attitude_s, depth_s: when attitudes and depths were last used.
 
-    The lights: detection (2, 2): by observer and light, how likely a light in the picture is found. last_seen (2,):
+    The lights: detection (2, 2): by observer and light, how often a light in the picture is found; shown (2, 2): how
+    likely it was to be found at shown_s, by observer, after the last picture had told. last_seen (2,):
     the probability that each light is among the last picture's candidates, None where not both should be in it.
     lit_s (2, 2): when each was last used. light_s: when any was, at first the start, which is made of lights; trigger:
     time, observer and light of those of the last trigger. pictures: how many it has taken since it is confirmed; bare:
@@ -61,6 +62,8 @@ class Estimate:
     baseline: float = 0.0
     detection: Floats = field(default_factory=lambda: np.full((2, 2), 0.8))
     rates_radps: Floats = field(default_factory=lambda: np.zeros((2, 3)))
+    shown: Floats = field(default_factory=lambda: np.full((2, 2), 0.8))
+    shown_s: list[float] = field(default_factory=lambda: [-np.inf, -np.inf])
     lit_s: Floats = field(default_factory=lambda: np.full((2, 2), -np.inf))
     light_s: float = -np.inf
     trigger: list[tuple[float, int, int]] = field(default_factory=list)
@@ -115,10 +118,10 @@ class Estimate:
 
     def copied(self, **changes: object) -> Estimate:
         """Give an estimate that goes its own way from here."""
-        of_nodes = "evidence_by", "attitude_s", "told_by", "missed", "looks_away", "without", "turning_off"
+        of_nodes = "evidence_by", "attitude_s", "told_by", "missed", "looks_away", "without", "turning_off", "shown_s"
         lists = *of_nodes, "trigger", "course", "saw"
         own: dict[str, object] = {name: list(getattr(self, name)) for name in lists}
-        own |= {"detection": self.detection.copy(), "lit_s": self.lit_s.copy()}
+        own |= {"detection": self.detection.copy(), "shown": self.shown.copy(), "lit_s": self.lit_s.copy()}
         own |= {"steps": self.steps.copy(), "used": dict(self.used)}
         return replace(self, **(own | changes))  # type: ignore[arg-type]
 

@@ -201,6 +201,10 @@ class TrackMoves(TrackIntake):
                 estimate.without[node] = without
                 walk[GYRO_BIAS[node].start - MOVING : GYRO_BIAS[node].stop - MOVING] += WITHOUT_RADPS**2
                 walk[MOUNT[node].start - MOVING : MOUNT[node].stop - MOVING] += WITHOUT_RAD**2
+                stated = self.turning[node].stated(t_s)
+                if without and stated is not None:
+                    # From now on the mount's place has the heading's slow error, which may be all of what is stated.
+                    walk[MOUNT[node].stop - 1 - MOVING] += stated[1] ** 2
         estimate.covariance = predicted(estimate.covariance, F, Q, walk)
         estimate.state, estimate.t_s = after, t_s
         estimate.rates_radps = parts.rate_radps

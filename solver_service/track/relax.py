@@ -35,8 +35,9 @@ from buddyline.solver_service.track.seeing import (
     PassGuide,
     counted,
     counted_more,
+    found_now,
     in_front,
-    learn_detection,
+    learn_found,
     light_rows,
     note_lit,
     stacked,
@@ -308,9 +309,10 @@ class PathPass(TrackSteps):
             kept = self.guides[observer, sight.stamp_ns].look.chosen
             return Association(in_front(kept, by_path.y), np.zeros(2), 0.0)
         inside = [in_picture(camera, pixel_of(camera, X), EDGE_PX) for X in by_path.X]
-        found = by_path.odds.associate(sight.sigma_px, main.detection[observer], np.array(inside, dtype=float), LIKELY)
+        detection = found_now(main, observer, sight.t_s)
+        found = by_path.odds.associate(sight.sigma_px, detection, np.array(inside, dtype=float), LIKELY)
         main.evidence += found.evidence
-        learn_detection(main.detection[observer], inside, found.seen)
+        learn_found(main, observer, sight.t_s, detection, inside, found.seen)
         if all(inside):
             self.lamps.take(1 - observer, sight.t_s, found.seen)
         return replace(found, chosen=in_front(found.chosen, by_path.y))

@@ -51,6 +51,12 @@ INSIDE: Final = 0.9
 WIDE_SHARE: Final = 0.02
 # A wide estimate takes its lights in so many steps.
 ABOUT_STEPS: Final = 4
+# A lamp stays hidden, or in view, for about so long. One in view is missed as often as it is hidden when it is hidden
+# least.
+HIDDEN_S: Final = 1.0
+MOST_FOUND: Final = 0.97
+LEAST_FOUND: Final = 0.02
+FOUND_IN_VIEW: Final = math.sqrt(MOST_FOUND)
 _STILL: Final = np.eye(MOVING)
 
 
@@ -102,7 +108,7 @@ class TrackSights(TrackMoves):
         # Association and evidence of a start use the plain sigmas, so that all starts compete alike.
         if estimate.confirmed:
             sight = _widened(sight, H, estimate.covariance)
-        detection = estimate.detection[observer]
+        detection = found_now(estimate, observer, sight.t_s)
         place = place_covariance(estimate.state, estimate.covariance)
         share = math.sqrt(place.trace()) / float(np.linalg.norm(estimate.state.r_m))
         wide, estimate.wide = share > 0.1, share > WIDE_SHARE
@@ -137,7 +143,7 @@ class TrackSights(TrackMoves):
         elif any(inside) and not wide:
             estimate.missed[observer] += 1
         estimate.last_seen = found.seen if all(inside) and not wide else None
-        learn_detection(estimate.detection[observer], inside, found.seen)
+        learn_found(estimate, observer, sight.t_s, detection, inside, found.seen)
         estimate.looks_away[observer] = not found.chosen
         if found.chosen:
             if not estimate.confirmed:
@@ -287,15 +293,33 @@ def told_by(
     return error, chi2
 
 
-def learn_detection(detection: Floats, inside: Sequence[bool], seen: Floats) -> None:
-    """Take into detection (2,) whether each light that should be in a picture was seen there (2,).
+def found_now(estimate: Estimate, observer: int, t_s: float) -> Floats:
+    """Give how likely each light (2,) in an observer's picture at t_s is found: as just before, or as it is on average.
 
-    A lamp that is known not to be lit stays at 0.
+    A lamp that is known not to be lit is not found.
     """
+    share = estimate.detection[observer]
+    kept = math.exp(-max(t_s - estimate.shown_s[observer], 0.0) / HIDDEN_S)
+    found = share + kept * (estimate.shown[observer] - share)
+    return np.where(share > 0.0, np.clip(found, LEAST_FOUND, MOST_FOUND), 0.0)
+
+
+def learn_found(
+    estimate: Estimate, observer: int, t_s: float, found: Floats, inside: Sequence[bool], seen: Floats
+) -> None:
+    """Take into an estimate whether each light that should be in a picture was seen there (2,).
+
+    found (2,): how likely that was, by `found_now`. A lamp that is not seen may be in view and missed, too.
+    """
+    estimate.shown[observer], estimate.shown_s[observer] = found, t_s
     for light in (0, 1):
-        if inside[light] and detection[light] > 0.0:
-            old = detection[light]
-            detection[light] = min(max(old + 0.05 * (seen[light] - old), 0.02), 0.97)
+        share = estimate.detection[observer, light]
+        if inside[light] and share > 0.0:
+            share += 0.05 * (seen[light] - share)
+            estimate.detection[observer, light] = min(max(share, LEAST_FOUND), MOST_FOUND)
+            missed, hidden = found[light] * (1.0 - FOUND_IN_VIEW), FOUND_IN_VIEW - found[light]
+            in_view = seen[light] + (1.0 - seen[light]) * missed / (missed + hidden)
+            estimate.shown[observer, light] = FOUND_IN_VIEW * in_view
 
 
 def light_rows(chosen: Chosen, y: Floats, H: Floats) -> tuple[Floats, Floats, Floats]:

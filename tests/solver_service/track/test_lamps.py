@@ -11,8 +11,10 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import LightTruth, NodePose, Truth
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.trigger import Settings
+from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.lamps import LampWatch
-from buddyline.solver_service.track.seeing import learn_detection
+from buddyline.solver_service.track.seeing import found_now, learn_found
+from buddyline.solver_service.track.state import SIZE, State
 from buddyline.solver_service.tracking import TrackSettings
 
 from tests.solver_service.track.dives import EPOCH_NS
@@ -89,11 +91,44 @@ def test_a_lamp_of_nobody_is_refused():
         Scenario(dead_lamps=("c.left",))
 
 
+def looked(pictures, first=0.8, second=0.8):
+    """What node a has learned at 10 Hz, from 0.1 s on: by what is seen of each light, and what should be in view."""
+    state = State.at_rest(np.zeros(3), np.stack((np.eye(3), np.eye(3))))
+    told = Estimate(0.0, state, np.eye(SIZE), 0.0, detection=np.array(((first, second), (0.8, 0.8))))
+    for k, (seen, inside) in enumerate(pictures):
+        t_s = 0.1 * (k + 1)
+        learn_found(told, 0, t_s, found_now(told, 0, t_s), inside, np.array(seen))
+    return told, 0.1 * len(pictures)
+
+
 def test_a_lamp_that_is_known_to_be_dark_stays_so_and_others_are_learned():
-    found = np.array((0.0, 0.5))
-    for seen in ((1.0, 1.0), (0.0, 1.0)):
-        learn_detection(found, (True, True), np.array(seen))
-    assert found[0] == 0.0
-    assert found[1] > 0.5
-    learn_detection(found, (True, False), np.array((0.0, 0.0)))
-    assert found[1] > 0.5
+    told, now_s = looked([((1.0, 1.0), (True, True)), ((0.0, 1.0), (True, True))], 0.0, 0.5)
+    assert told.detection[0, 0] == 0.0
+    assert found_now(told, 0, now_s)[0] == 0.0
+    assert told.detection[0, 1] > 0.5
+    assert (told.detection[1] == 0.8).all()
+    told, _ = looked([((0.0, 0.0), (False, False))], 0.0, 0.5)
+    assert told.detection[0].tolist() == [0.0, 0.5]
+
+
+IN_VIEW, HIDDEN = ((1.0, 1.0), (True, True)), ((0.0, 1.0), (True, True))
+
+
+@pytest.mark.parametrize(
+    ("pictures", "next_s", "least", "most"),
+    [
+        ([IN_VIEW] * 40, 0.1, 0.95, 0.98),
+        # One picture may have missed it.
+        ([IN_VIEW] * 40 + [HIDDEN], 0.1, 0.4, 0.7),
+        ([IN_VIEW] * 40 + [HIDDEN] * 3, 0.1, 0.0, 0.2),
+        ([IN_VIEW] * 40 + [HIDDEN] * 3, 5.0, 0.8, 0.9),
+        # Hidden as often as in view, and in view just now.
+        (([HIDDEN] * 10 + [IN_VIEW] * 10) * 3, 0.1, 0.9, 0.98),
+        (([HIDDEN] * 10 + [IN_VIEW] * 10) * 3, 5.0, 0.3, 0.8),
+    ],
+)
+def test_a_lamp_that_is_hidden_or_in_view_mostly_stays_so(pictures, next_s, least, most):
+    """Else a false candidate in a hidden one's place is taken for it, and one lamp of a bar for the other."""
+    told, now_s = looked(pictures)
+    assert least < found_now(told, 0, now_s + next_s)[0] < most
+    assert found_now(told, 0, now_s + next_s)[1] == pytest.approx(0.96, abs=0.02)
