@@ -14,6 +14,8 @@ from buddyline.solver_service.track.trail import Chosen, Trail
 from buddyline.solver_service.track.vibration import SHARES, Shares
 from buddyline.solver_service.track.walking import Walking
 
+# A lamp and its reflection look like a bar for no longer than this.
+REFLECTED_S: Final = 4.5
 # A challenger that has not replaced the track after so long is dropped.
 CHALLENGE_S: Final = 4.0
 
@@ -37,9 +39,9 @@ class Estimate:
     lit_s (2, 2): when each was last used. light_s: when any was, at first the start, which is made of lights; trigger:
     time, observer and light of those of the last trigger. pictures: how many it has taken since it is confirmed; bare:
     of these, how many while a node had no inertial unit. bars: how many pictures showed both lights, bar_s: when one
-    last did; told_by: how many of each node showed any. missed: in how many of each node's last pictures, on end, a
-    light should be and none was used. looks_away: whether each node's last picture has shown none, wherever they should
-    be. unseen_by: a node that has shown no light yet.
+    last did; late_bars: how many did from REFLECTED_S after the start on. told_by: how many of each node showed any.
+    missed: in how many of each node's last pictures, on end, a light should be and none was used. looks_away: whether
+    each node's last picture has shown none, wherever they should be. unseen_by: a node that has shown no light yet.
 
     How well it fits: evidence: log odds over clutter; evidence_by: of each node's pictures. baseline: the main
     estimate's at the start. surprise, told: chi^2 of the lights used, and of how many residuals; lasted: of how many
@@ -90,6 +92,7 @@ class Estimate:
     pictures: int = 0
     bare: int = 0
     bars: int = 0
+    late_bars: int = 0
     bar_s: float = -np.inf
     told_by: list[int] = field(default_factory=lambda: [0, 0])
     missed: list[int] = field(default_factory=lambda: [0, 0])

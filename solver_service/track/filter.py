@@ -46,8 +46,10 @@ FIXES_TO_REPLACE: Final = 3
 FIXES_TO_DOUBT: Final = 2
 FIXES_TO_SAY: Final = 5
 SHARE_TO_DOUBT: Final = 0.2
-# A start without a fix can drift in range, with too small a covariance, while it follows single lights. Live, it is not
-# told after LONE_S of them, until BARS_TO_FOLLOW pictures have shown both lights or a fix has agreed.
+# A start without a fix may follow a lamp and its reflection for up to REFLECTED_S, or drift in range by single lights,
+# with too small a covariance. Live, it is not told until LATE_BARS pictures have shown both lights after that, nor
+# after LONE_S of single lights until BARS_TO_FOLLOW have in all; but where a fix has agreed.
+LATE_BARS: Final = 8
 LONE_S: Final = 1.0
 BARS_TO_FOLLOW: Final = 25
 # A rival that began so much later than the best is younger.
@@ -158,8 +160,8 @@ class TrackFilter(TrackPool):
         """Whether a live track is not to be told; `problems` says why.
 
         Its clocks prove further apart than it bears, or did lately, or the last fixes contradict it: its first updates
-        were then far from linear. Or it follows single lights before it is well founded. A track that starts anew
-        believes in its clocks anew.
+        were then far from linear. Or no fix has agreed with it, and few pictures have shown both lights. A track that
+        starts anew believes in its clocks anew.
         """
         main = self.main
         if main is None:
@@ -175,16 +177,16 @@ class TrackFilter(TrackPool):
             self._problems.report(f"{self.both}: their clocks are far apart: no live track", main.t_s)
         if contradicted and main.contradicted >= FIXES_TO_SAY:
             self._problems.report(f"{self.both}: poses contradict the live track", main.t_s)
-        lone = self._lone(main)
-        if lone:
-            self._problems.report(f"{self.both}: single lights alone, too early: no live track", main.t_s)
-        return apart or contradicted or lone
+        founded = not main.searched or main.agreed > 0 or self._followed(main)
+        if main.confirmed and not founded:
+            self._problems.report(f"{self.both}: no pose, and few pictures with both lamps: no live track", main.t_s)
+        return apart or contradicted or not founded
 
     @staticmethod
-    def _lone(main: Estimate) -> bool:
-        """Whether a start without a fix follows single lights before enough pictures with both have founded it."""
-        founded = not main.searched or main.agreed > 0 or main.bars >= BARS_TO_FOLLOW
-        return not founded and main.light_s - main.bar_s > LONE_S
+    def _followed(main: Estimate) -> bool:
+        """Whether enough pictures have shown both lights to found a start without a fix."""
+        lately = main.light_s - main.bar_s < LONE_S
+        return main.late_bars >= LATE_BARS and (main.bars >= BARS_TO_FOLLOW or lately)
 
     def _take_sight(self, t_s: float, sight: Sight) -> None:
         self._check_units(t_s)

@@ -12,7 +12,7 @@ from buddyline.solver_service.geometry.observation import STAMP_SIGMA_S
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.association import LIKELY, SURE, Association, Odds, associate, odds_of
-from buddyline.solver_service.track.estimate import Estimate
+from buddyline.solver_service.track.estimate import REFLECTED_S, Estimate
 from buddyline.solver_service.track.inputs import TrackNode
 from buddyline.solver_service.track.lights import (
     BLOCK,
@@ -155,6 +155,7 @@ class TrackSights(TrackMoves):
             if len(found.chosen) == 2:
                 estimate.bars += 1
                 estimate.bar_s = sight.t_s
+                estimate.late_bars += sight.t_s > estimate.start_s + REFLECTED_S
             estimate.told_by[observer] += 1
         return Look(observer, sight.stamp_ns, sight.t_s, found.chosen), turn
 
@@ -296,9 +297,12 @@ def told_by(
 def found_now(estimate: Estimate, observer: int, t_s: float) -> Floats:
     """Give how likely each light (2,) in an observer's picture at t_s is found: as just before, or as it is on average.
 
-    A lamp that is known not to be lit is not found.
+    A lamp that is known not to be lit is not found. Starts compete by how often each has a lamp found, not by its being
+    missing for long: a wrong one would have its missing lamp explained.
     """
-    share = estimate.detection[observer]
+    share: Floats = estimate.detection[observer]
+    if not estimate.confirmed:
+        return share
     kept = math.exp(-max(t_s - estimate.shown_s[observer], 0.0) / HIDDEN_S)
     found = share + kept * (estimate.shown[observer] - share)
     return np.where(share > 0.0, np.clip(found, LEAST_FOUND, MOST_FOUND), 0.0)

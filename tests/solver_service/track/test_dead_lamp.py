@@ -34,7 +34,7 @@ def dead_lamp_dive(seed: int, lamp: tuple[int, int], seconds: float) -> KnownDiv
 def test_the_live_track_is_honest_from_its_start_on() -> None:
     judged = []
     for seed, lamp in enumerate(LAMPS):
-        dive = dead_lamp_dive(40 + seed, lamp, 14.0)
+        dive = dead_lamp_dive(40 + seed, lamp, 20.0)
         rows = filter_of(dive.records, ()).advance(last_ns(dive.records), dive.stamps_ns)
         judged.append(score(dive, rows))
     assert sum(one.wrong for one in judged) == 0
@@ -75,7 +75,7 @@ def simulated(scenario: Scenario, seconds: float, mode: TrackMode = "smooth") ->
     ]
     tracks = [one for one in told + core.flush() if isinstance(one, Track)]
     sigma_m = np.sqrt([one.covariance[0] + one.covariance[7] + one.covariance[14] for one in tracks])
-    off_m = np.array([np.subtract(one.t_a_b_m, world.truth(one.stamp_ns, 0).t_a_b_m) for one in tracks])
+    off_m = np.array([np.subtract(one.t_a_b_m, world.truth(one.stamp_ns, 0).t_a_b_m) for one in tracks]).reshape(-1, 3)
     range_m = np.array([one.range_m for one in tracks])
     wrong = int(((np.linalg.norm(off_m, axis=1) - 3.0 * sigma_m) > 0.1 * range_m).sum())
     return wrong, float((sigma_m < 0.05 * range_m).sum() / (seconds * 20.0))
@@ -94,7 +94,7 @@ def test_a_track_that_is_replaced_and_that_no_fix_agreed_with_leaves_no_rows() -
 def test_a_younger_start_that_explains_the_pictures_better_replaces_a_live_track() -> None:
     """The older one has drifted off when it is confirmed: what it explained before the younger one began is no lead."""
     wrong, share = simulated(
-        Scenario("night_reef", seed=2006, start_ns=EPOCH_NS, inertial="poor", dead_lamps=("a.left",)), 6.0, "filter"
+        Scenario("night_reef", seed=2006, start_ns=EPOCH_NS, inertial="poor", dead_lamps=("a.left",)), 12.0, "filter"
     )
     assert wrong == 0
     assert share > 0.3
@@ -103,7 +103,7 @@ def test_a_younger_start_that_explains_the_pictures_better_replaces_a_live_track
 def test_the_replay_of_a_start_decides_the_lights_again() -> None:
     """Lights that are left out because a start has drifted off leave too little for a replay with the others."""
     wrong, share = simulated(
-        Scenario("lake", seed=2147, start_ns=EPOCH_NS, inertial="poor", dead_lamps=("a.right",)), 6.0, "filter"
+        Scenario("lake", seed=2147, start_ns=EPOCH_NS, inertial="poor", dead_lamps=("a.right",)), 12.0, "filter"
     )
     assert wrong == 0
     assert share > 0.15
@@ -119,6 +119,18 @@ def test_the_age_of_the_lights_is_known_before_the_first_is_used() -> None:
     track._step(estimate, 1.05, None)
     (row,) = rows_between(smoothed(estimate.steps), np.array((1.02,)), [EPOCH_NS])
     assert row.age_s == pytest.approx(0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [9301, 9321])
+def test_a_lamp_and_its_reflection_are_no_bar(seed: int) -> None:
+    """Each node has a dark lamp. For some seconds what is lit looks like a whole bar: 6 m off, stated as 4 cm."""
+    water = ("cavern", "basin", "lake")[seed % 3]
+    dead = ("a.left", "b.right")
+    scenario = Scenario(water, seed=seed, start_ns=EPOCH_NS, inertial="poor", dead_lamps=dead)
+    wrong, share = simulated(scenario, 60.0, "filter")
+    assert wrong == 0
+    assert share == 0.0
 
 
 @pytest.mark.slow

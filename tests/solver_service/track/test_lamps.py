@@ -94,7 +94,7 @@ def test_a_lamp_of_nobody_is_refused():
 def looked(pictures, first=0.8, second=0.8):
     """What node a has learned at 10 Hz, from 0.1 s on: by what is seen of each light, and what should be in view."""
     state = State.at_rest(np.zeros(3), np.stack((np.eye(3), np.eye(3))))
-    told = Estimate(0.0, state, np.eye(SIZE), 0.0, detection=np.array(((first, second), (0.8, 0.8))))
+    told = Estimate(0.0, state, np.eye(SIZE), 0.0, confirmed=True, detection=np.array(((first, second), (0.8, 0.8))))
     for k, (seen, inside) in enumerate(pictures):
         t_s = 0.1 * (k + 1)
         learn_found(told, 0, t_s, found_now(told, 0, t_s), inside, np.array(seen))
