@@ -5,9 +5,9 @@ turn rate (rad/s), all in A's camera frame. A fix outside the gate resets the fi
 overrides a measurement.
 
 Why the track does not replace it: the track starts from fixes and restarts where fixes contradict it, so a fix must not
-depend on the track. Without the prior, 28 dives (10 Hz, 30 to 60 s) give 7,619 poses in place of 9,364, and 9 wrong
-ones in place of 2: hardly a pose of three lights is sure enough without it. The track is the same in most of them, but
-has nothing to start from in one.
+depend on the track. Without the prior, as it was when this was measured, 28 dives (10 Hz, 30 to 60 s) gave 7,619
+poses in place of 9,364, and 9 wrong ones in place of 2: hardly a pose of three lights is sure enough without it. The
+track was the same in most of them, but had nothing to start from in one.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from buddyline.solver_service.geometry.se3 import SE3
 LIFETIME_NS: Final = 2 * S_NS
 # Motion of divers and of the cameras they hold: spectral densities of white acceleration between them, (m/s^2)^2/Hz,
 # and of each one's white angular acceleration, (rad/s^2)^2/Hz. A's turns move B in A's frame, the more the further away
-# it is. Over half a second the demo's divers have 0.5 along the line of sight, 1.1 across it at 5.6 m, and 0.15.
+# it is. Over half a second the demo's divers have, as roots of densities, 0.5 m/s^2 per root Hz along the line of
+# sight, 1.1 across it at 5.6 m, and 0.15 rad/s^2 per root Hz of turning.
 ACCELERATION_DENSITY: Final = 0.3**2
 TURN_DENSITY: Final = 0.25**2
 # Initial 1 sd of the pair's velocity and turn rate.
@@ -102,7 +103,7 @@ class PosePrior:
 
 
 def _density(t_m: Floats) -> Floats:
-    """Give the spectral density (6, 6) of both rates' white accelerations, with B at t_m in A's frame."""
+    """Give the spectral density (6, 6) of both rates' white accelerations, with B at t_m (3,) in A's frame."""
     density = np.diag([ACCELERATION_DENSITY] * 3 + [2.0 * TURN_DENSITY] * 3)
     # A turn of A by w moves B by t x w, and turns it by -w.
     by_a = skew(t_m)

@@ -117,8 +117,8 @@ class Prediction:
         """Give what the prediction adds (log) to the density of the only light of a node, K poses of three lights.
 
         That the other node's two lights agree with the prediction says nothing of it. rows: (K, n, 7) at T_a_b, of
-        lights and sensors, noise (K, n, n) of them. lone: (K, 2) its rows. density: (K,) of it by the other rows and
-        the headings, at its residuals.
+        lights and sensors, noise (K, n, n) of them. lone: (K, 2) its rows. density: (K,) of it, per square of its
+        sigma, by the other lights, tilts and headings.
         """
         k, n = np.arange(len(rows))[:, None], rows.shape[1]
         N = np.tile(np.eye(n), (len(rows), 1, 1)) if noise is None else noise.copy()
@@ -128,11 +128,13 @@ class Prediction:
         J, r = rows[:, :, :6], rows[:, :, 6:]
         weighted = J.swapaxes(1, 2) @ np.linalg.inv(N)
         covariance = np.linalg.inv(weighted @ J + self.information)
-        step = -covariance @ (weighted @ r + self.information @ self._off(T_a_b)[0][:, :, None])
+        off, trace = self._off(T_a_b)
+        step = -covariance @ (weighted @ r + self.information @ off[:, :, None])
         J, r = J[k, lone], r[k, lone]
         left, spread = r + J @ step, own + J @ covariance @ J.swapaxes(1, 2)
         chi2 = (left.swapaxes(1, 2) @ np.linalg.solve(spread, left))[:, 0, 0]
         foretold = np.exp(-0.5 * chi2) / (2.0 * math.pi * np.sqrt(np.linalg.det(spread)))
+        foretold = np.where(trace > 1.0, foretold, 0.0)
         gain: Floats = np.log(_PRIOR_WRONG + (1.0 - _PRIOR_WRONG) * foretold / density)
         return gain
 
@@ -172,7 +174,7 @@ class Past:
         return np.zeros(len(T_a_b)) if self.prediction is None else self.prediction.weigh(T_a_b, three=three)
 
     def weigh_lone(self, T_a_b: SE3, rows: Floats, noise: Floats | None, lone: Indices, density: Floats) -> Floats:
-        """Weigh the only lights of a node by the prediction, as it does."""
+        """Give what the prediction adds to the density of the only lights of a node (K,), 0 without a prediction."""
         if self.prediction is None:
             return np.zeros(len(T_a_b))
         return self.prediction.weigh_lone(T_a_b, rows, noise, lone, density)

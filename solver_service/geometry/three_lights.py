@@ -35,9 +35,9 @@ from numpy.typing import NDArray
 # chi^2 of tilt and depth, three degrees of freedom, after the refinement.
 _FITS_CHI2: Final = 16.0
 _STEPS: Final = 4
-# No gap tells a gross error of the pair: the covariance has its share of them.
 # Of which side each of four lights is.
 _SIDES: Final = np.array((0, 1, 0, 1))
+# No gap tells a gross error of the pair: the covariance has its share of them.
 UNCHECKED: Final = 1.0 + GROSS_PROBABILITY * (GROSS_SCALE**2 - 1.0)
 
 
@@ -61,7 +61,9 @@ def read_three_lights(batch: Batch, wanted: NDArray[np.bool_]) -> Read:
     range2 = inner(T_a_b.t_m, T_a_b.t_m)
     sound = refined.sound & (refined.solved.chi2 < _FITS_CHI2)
     sound &= (range2 > settings.range_min_m**2) & (range2 < settings.range_max_m**2)
-    log_ratio, turn, log_heading, turn_variance, *lone = _log_ratio(batch, guesses, across, T_a_b, refined)
+    log_ratio, turn, log_heading, turn_variance, lone_odds, lone_density = _log_ratio(
+        batch, guesses, across, T_a_b, refined
+    )
     sound &= np.isfinite(refined.solved.covariance.sum((1, 2)) + log_ratio)
     none, range_m = np.zeros(len(trigger)), np.sqrt(range2)
     starts = starts_of(np.bincount(trigger, minlength=batch.triggers))
@@ -87,8 +89,8 @@ def read_three_lights(batch: Batch, wanted: NDArray[np.bool_]) -> Read:
             range_m=np.stack((range_m, range_m), axis=1),
             twist_gap_rad=none,
             clutter=none,
-            lone_odds=lone[0],
-            lone_density=lone[1],
+            lone_odds=lone_odds,
+            lone_density=lone_density,
         ),
     )
 
@@ -224,7 +226,8 @@ def _gross_odds(batch: Batch, guesses: Guesses, T_a_b: SE3) -> Floats:
         fits *= np.exp(seen.log_side[other, _SIDES[missing[owner]]])
     # The third light, in the same picture, is no second one; nor is a light that stands behind the camera.
     fits[(other == lights.max(1, where=np.arange(4) // 2 == in_b[:, None], initial=-1)[owner]) | (along <= 0.0)] = 0.0
-    chance = seen.in_whole[guesses.trigger, in_b] / rigs.area_px2[in_b]
+    # The third light is not one of those that chance puts there.
+    chance = np.maximum(seen.in_whole[guesses.trigger, in_b] - 1, 1) / rigs.area_px2[in_b]
     found = np.bincount(owner, fits, minlength=len(lights))
     odds: Floats = GROSS_SHARE / MISSING_ODDS * found / (2.0 * math.pi * GROSS_PX**2 * chance)
     return odds

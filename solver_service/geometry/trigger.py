@@ -57,7 +57,7 @@ _SAME_POSITION: Final = 0.04
 _SAME_TRACE: Final = 1.0 + 2.0 * math.cos(0.1)
 # Three lights have no gap to check them, and the headings tell no better than this which of two lights a node sees.
 # They must be likelier where the motion prior decides for or against them, and more so than any other hypothesis: it
-# knows nothing of how a diver turns aside. In 210 simulated dives of half a minute none of 11,380 poses of three lights
+# knows nothing of how a diver turns aside. In 210 simulated dives of half a minute none of 11,059 poses of three lights
 # is wrong; with 0.995 against the others, too, 2 of 11,622 are, and with 0.98 against a false light 3 of 11,587.
 _THREE_PROBABILITY: Final = 0.98
 _FOLLOWED_PROBABILITY: Final = 0.99
@@ -179,8 +179,8 @@ class _Batched:
         unsure = sigma_m > _SURE_POSITION * range_m
         if short and unsure:
             return NoFix("ambiguous", f"three lights give {in_metres(range_m)} to {sigma_m:.2g} m only")
-        # A false candidate in a light's place is off by as much as the covariance has been widened for. What is widened
-        # for a gross error may as well be wrong by more: the lights do not fit each other.
+        # Three lights have no gap that tells a false one. Among four, it is off by as much as the covariance has been
+        # widened for; what is widened for a gross error may as well be wrong by more: the lights do not fit each other.
         false_light = ratio * math.exp(weighed.log_false[k]) if short or unsure or widened > 1.0 else 0.0
         probability = agreeing / (CHANCE_ODDS + agreeing + others + false_light)
         oriented = self.oriented[trigger] and "attitude" in settings.checks

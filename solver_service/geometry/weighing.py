@@ -106,10 +106,12 @@ def weigh_readings(read: Read, trigger: int, past: Past, settings: Settings, *, 
     if three:
         fit = log_fit(solved)
         covariance = UNCHECKED * covariance
-        foretold = past.weigh_lone(
-            readings.refined.T_a_b[place], rows, noise, _lone(readings.lights[place]), readings.lone_density[place]
-        )
-        log_false = np.log(readings.lone_odds[place]) - foretold - (log_past - log_prior)
+        # A learned heading stands for the sensors' own, in the light's density without the prediction.
+        learned = log_past - log_prior
+        density = readings.lone_density[place] * np.exp(learned)
+        foretold = past.weigh_lone(readings.refined.T_a_b[place], rows, noise, _lone(readings.lights[place]), density)
+        log_false = np.log(readings.lone_odds[place]) - learned - foretold
+        sound = sound & ~np.isnan(log_false)
     else:
         # Without both gaps the picture's chi2 would bring in what the settings leave out.
         chi2 = chi2 if settings.gaps == 2 else readings.gap_chi2[place]
@@ -146,7 +148,10 @@ def _likeliest(log_ratio: Floats, read_at: Indices) -> Indices:
 
 
 def _rows(readings: Readings, place: Indices, past: Past) -> tuple[Floats, Floats | None]:
-    """Give the readings' rows and their residuals' covariance, for what is known of the motion; None: of unit noise."""
+    """Give the readings' rows (M, n, 7) and their residuals' covariance (M, n, n), for what is known of the motion.
+
+    None in its place: of unit noise.
+    """
     rows, dt_s = readings.refined.rows[place], readings.dt_s[place]
     if past.settings.still and not dt_s.any():
         return rows, None

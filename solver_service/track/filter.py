@@ -48,7 +48,7 @@ FIXES_TO_SAY: Final = 5
 SHARE_TO_DOUBT: Final = 0.2
 # A start without a fix may follow a lamp and its reflection for up to REFLECTED_S, or drift in range by single lights,
 # with too small a covariance. Live, it is not told until LATE_BARS pictures have shown both lights after that, nor
-# after LONE_S of single lights until BARS_TO_FOLLOW have in all; but where a fix has agreed.
+# after LONE_S of single lights until BARS_TO_FOLLOW have in all, unless a fix has agreed.
 LATE_BARS: Final = 8
 LONE_S: Final = 1.0
 BARS_TO_FOLLOW: Final = 25

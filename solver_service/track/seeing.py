@@ -302,7 +302,7 @@ def found_now(estimate: Estimate, observer: int, t_s: float) -> Floats:
     """
     share: Floats = estimate.detection[observer]
     if not estimate.confirmed:
-        return share
+        return share.copy()
     kept = math.exp(-max(t_s - estimate.shown_s[observer], 0.0) / HIDDEN_S)
     found = share + kept * (estimate.shown[observer] - share)
     return np.where(share > 0.0, np.clip(found, LEAST_FOUND, MOST_FOUND), 0.0)

@@ -7,7 +7,7 @@ import pytest
 from buddyline.solver_service.geometry.batch import Batch
 from buddyline.solver_service.geometry.evidence import GROSS_PX, GROSS_SHARE, MISSING_ODDS
 from buddyline.solver_service.geometry.four_lights import read_four_lights
-from buddyline.solver_service.geometry.observation import Observation
+from buddyline.solver_service.geometry.observation import Heading, Observation
 from buddyline.solver_service.geometry.past import Past
 from buddyline.solver_service.geometry.rotation import rotation_exp, skew
 from buddyline.solver_service.geometry.se3 import SE3
@@ -179,8 +179,8 @@ def test_four_lights_that_fit_are_likelier_than_any_three_of_them(sigma_px):
         scene = random_scene(rng, (2.0, 6.0))
         seen = [v for v, _ in scene.views(rng, sigma_px)], scene, scene.sensed(rng)
         four, three = log_ratio(*seen, three=False), log_ratio(*seen, three=True)
-        # The fourth stands by chance in its place: within some 10 px^2 of 2 million, for want of any one in five.
-        assert four > three + 3.0
+        # For three alone the fourth stands in its place by chance or by a gross error of 7 px.
+        assert four > three + 2.0
 
 
 @pytest.mark.parametrize("missing", range(4))
@@ -198,7 +198,7 @@ def test_a_candidate_beside_the_fourth_lights_place_speaks_for_the_three(missing
             both = [view(np.concatenate(pixels), 0.05) if k == node else views[k] for k in (0, 1)]
             found.append(log_ratio(both, scene, scene.sensed(), three=True))
         density = np.exp(-0.5 * (4.0 / GROSS_PX) ** 2) / (2.0 * np.pi * GROSS_PX**2)
-        odds = GROSS_SHARE / MISSING_ODDS * density * (1640 * 1232) / 2
+        odds = GROSS_SHARE / MISSING_ODDS * density * (1640 * 1232)
         assert found[0] - found[1] == pytest.approx(np.log1p(odds), abs=0.3)
 
 
@@ -229,6 +229,42 @@ def test_only_what_foretells_the_lone_light_speaks_for_it():
     assert np.median(known) > 3.0
     assert np.median(turning) < 1.0
     assert np.median(by_both) > 3.0
+
+
+def test_a_learned_heading_says_no_more_of_a_lone_light_that_is_foretold_better():
+    rng = np.random.default_rng(12)
+    told = 0
+    for _ in range(10):
+        scene = random_scene(rng, (3.0, 6.0))
+        views = without(scene, 0, rng, 0.5)
+        batch = Batch.of([Observation(*views, *scene.sensed())], (scene.rig_a, scene.rig_b), SETTINGS)
+        prior = Prior(SE3(scene.R, scene.t), 1e-6 * np.eye(6))
+        odds = []
+        for heading in (None, Heading(0.0, 1e-4)):
+            past = Past.of(prior, heading, 3e-7, batch.rigs, SETTINGS)
+            with np.errstate(all="ignore"):
+                weighed = weigh_readings(
+                    read_three_lights(batch, np.ones(1, dtype=bool)), 0, past, SETTINGS, three=True
+                )
+            odds.append(weighed.log_false[int(weighed.log_ratio.argmax())])
+        told += abs(odds[1] - odds[0]) < 0.1
+    assert told >= 9
+
+
+def test_half_a_turn_from_the_prediction_is_not_foretold():
+    rng = np.random.default_rng(13)
+    scene = random_scene(rng, (3.0, 6.0))
+    batch = Batch.of([Observation(*without(scene, 0, rng, 0.5), *scene.sensed())], (scene.rig_a, scene.rig_b), SETTINGS)
+    read = read_three_lights(batch, np.ones(1, dtype=bool))
+    T_a_b, rows = read.readings.refined.T_a_b[:1], read.readings.refined.rows[:1]
+    u = T_a_b.t_m[0] / np.linalg.norm(T_a_b.t_m[0])
+    gains = []
+    for turn in (0.0, np.pi):
+        prior = Prior(SE3(rotation_exp(turn * u) @ T_a_b.R[0], T_a_b.t_m[0]), 1e-4 * np.eye(6))
+        past = Past.of(prior, None, 3e-7, batch.rigs, SETTINGS)
+        gains.append(past.weigh_lone(T_a_b, rows, None, np.array([[2, 3]]), np.array([1e-6]))[0])
+    assert gains[0] > 5.0
+    assert gains[1] == pytest.approx(np.log(0.15))
 
 
 def test_two_lights_are_no_pose():
