@@ -159,7 +159,7 @@ def test_the_far_end_s_ellipse_holds_a_gyroscope_that_wanders():
 def test_a_gyroscope_s_turns_are_those_of_the_legs():
     rng = np.random.default_rng(4)
     course = world.line(rng, 4)
-    messages = world.dive(course, rng, world.Flaws(), 8.0, 12.0)
+    messages = world.dive(course, rng, world.Flaws(), 10.0, 12.0)
     derived = Derived()
     derived.add(of_messages(messages), SurveySettings(), AlarmSettings())
     legs = {leg.start_ns: leg for leg in derived.legs}
