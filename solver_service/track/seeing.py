@@ -51,8 +51,8 @@ INSIDE: Final = 0.9
 WIDE_SHARE: Final = 0.02
 # A wide estimate takes its lights in so many steps.
 ABOUT_STEPS: Final = 4
-# A lamp stays hidden, or in view, for about so long. One in view is missed as often as it is hidden when it is hidden
-# least.
+# A lamp stays hidden, or in view, for about so long. It is found in a share of its pictures between the next two.
+# One that is found most often is hidden as rarely as it is missed while it is in view.
 HIDDEN_S: Final = 1.0
 MOST_FOUND: Final = 0.97
 LEAST_FOUND: Final = 0.02
