@@ -17,6 +17,7 @@ from buddyline.solver_service.track.lights import BLOCK, Sight, with_stamp
 from buddyline.solver_service.track.lone import fits, state_of
 from buddyline.solver_service.track.moving import HOLD_S
 from buddyline.solver_service.track.search import starts
+from buddyline.solver_service.track.seeing import in_front
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.smoother import smoothed
 from buddyline.solver_service.track.start import CLOCK_S, constants_of
@@ -260,13 +261,17 @@ class TrackPool(TrackSteps):
                 if chi2 > 12.0:
                     continue
                 child = estimate.copied(unseen_by=None)
+                chosen = ((k, light, START_PX**2),)
+                # One linear step with a heading off by 17 degrees would end 22 px beside the light, with a sigma of 3.
+                near_y, near_H = self._about(child, sight, chosen, None)
+                if not in_front(chosen, near_y):
+                    continue
                 spread = float(np.linalg.det(S))
                 if spread <= 0.0:
                     raise ArithmeticError("a light's place without a covariance")
                 gain = -0.5 * chi2 - 0.5 * math.log(spread) - math.log(2.0 * math.pi) - log_clutter
                 child.evidence += gain + math.log(0.2)
-                chosen = ((k, light, START_PX**2),)
-                self._update_lights(child, Association(chosen, np.ones(2), 0.0), y, H, sight)
+                self._update_lights(child, Association(chosen, np.ones(2), 0.0), near_y, near_H, sight)
                 child.used[sight.node, sight.stamp_ns] = chosen
                 child.looks_away[sight.node] = False
                 if child.steps:

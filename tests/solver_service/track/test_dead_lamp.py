@@ -146,6 +146,17 @@ def test_a_young_start_that_follows_single_lights_is_not_told() -> None:
 
 
 @pytest.mark.slow
+def test_a_start_with_both_compasses_off_takes_the_lamp_that_is_lit() -> None:
+    """Their headings are 17 degrees apart: the dark lamp was nearer to where one linear step put the lit one."""
+    scenario = Scenario(
+        ENVIRONMENTS[0], seed=1015, start_ns=EPOCH_NS, inertial="poor", dead_lamps=("a.right",)
+    )
+    wrong, share = simulated(scenario, 40.0, "filter")
+    assert wrong == 0
+    assert share > 0.7
+
+
+@pytest.mark.slow
 def test_a_second_pass_that_the_dive_s_beginning_leads_astray_begins_with_the_first_pass() -> None:
     """The first start is 11 s late, and what is carried back from it is off by half the range: there was no row."""
     wrong, share = simulated(

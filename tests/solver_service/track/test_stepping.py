@@ -23,7 +23,7 @@ from buddyline.solver_service.track.lights import COLUMNS, Sight, light_position
 from buddyline.solver_service.track.moving import HOLD_S, KNOWN_CLOCK_S
 from buddyline.solver_service.track.records import last_ns
 from buddyline.solver_service.track.seeing import _widened, light_rows, noise_of, stacked
-from buddyline.solver_service.track.state import CLOCK, MOVING, PHI, R_, SIZE, V_, State
+from buddyline.solver_service.track.state import CLOCK, MOVING, PHI, R_, SIZE, V_, State, of_place
 from buddyline.solver_service.track.strapdown import Noise
 from buddyline.solver_service.track.trail import Chosen
 from buddyline.solver_service.track.walking import Walking
@@ -173,8 +173,8 @@ def test_attitudes_that_are_only_noisy_seldom_startle() -> None:
     assert 0.005 < np.mean(startled(rng.normal(0.0, 1.0, (4000, 3)))) < 0.025
 
 
-def test_lights_after_seconds_of_darkness_are_believed_where_they_are() -> None:
-    """One linear step from a prediction that is a metre off ended up to 300 px beside the lights it had used."""
+def known_pair() -> tuple[TrackFilter, Estimate, list[Sight]]:
+    """Give a filter, its track of both nodes, and each node's picture of the other's lights, exactly where they are."""
     dive = make(1, Setting(seconds=3.0))
     track = filter_of(dive.records, dive.fixes)
     track.advance(last_ns(dive.records))
@@ -187,6 +187,18 @@ def test_lights_after_seconds_of_darkness_are_believed_where_they_are() -> None:
         X, _ = light_positions(known.state, node, lights_m, known.rates_radps, np.zeros(1))
         pixels = np.array((409.5, 307.5)) + 900.0 * X[0, :, :2] / X[0, :, 2:]
         sights.append(sight_of(rig, node, known.t_s, FrameSeen(0, pixels, np.full(2, 0.7))))
+    return track, known, sights
+
+
+def off_px(track: TrackFilter, estimate: Estimate, sight: Sight) -> Floats:
+    """Give how far (K, L) each candidate of a picture is off each light."""
+    *_, y, _ = track._compared(sight, estimate.state, estimate.rates_radps, 0.0)
+    return np.linalg.norm(y, axis=2)
+
+
+def test_lights_after_seconds_of_darkness_are_believed_where_they_are() -> None:
+    """One linear step from a prediction that is a metre off ended up to 300 px beside the lights it had used."""
+    track, known, sights = known_pair()
     roots = np.zeros(SIZE)
     roots[R_], roots[PHI[0]], roots[PHI[1]] = 0.7, 0.03, 0.06
     rng = np.random.default_rng(7)
@@ -198,10 +210,21 @@ def test_lights_after_seconds_of_darkness_are_believed_where_they_are() -> None:
         for sight in sights:
             track._take_lights(estimate, sight)
         for sight in sights:
-            lights_m = track.nodes[1 - sight.node].rig.lights_m
-            X, D = light_positions(estimate.state, sight.node, lights_m, estimate.rates_radps, sight.dt_s)
-            y, _ = residuals(sight.bearings, sight.tangents, X, D)
-            assert np.abs(np.array((y[0, 0], y[1, 1]))).max() < 5.0
+            assert np.diag(off_px(track, estimate, sight)).max() < 5.0
+
+
+def test_a_fork_is_believed_where_its_light_is() -> None:
+    """With compasses 17 degrees off one linear step ended 25 px beside the light, and the right lamp was given up."""
+    track, known, sights = known_pair()
+    at, roots = known.state, np.zeros(SIZE)
+    roots[R_], roots[PHI[0]], roots[PHI[1]] = 0.3, (0.02, 0.02, 0.06), (0.02, 0.02, 0.12)
+    turned = at.moved(at.r_m, at.v_mps, np.stack((at.R[0], rotation_exp(np.array((0.0, 0.0, 0.3))) @ at.R[1])))
+    off = replace(known, state=turned, covariance=of_place(turned, np.diag(roots**2)), unseen_by=1)
+    track._fork(off, known.t_s, sights[1])
+    forks = [(fork, *fork.used[1, 0]) for fork in track.challengers]
+    assert {(k, light) for _, (k, light, _) in forks} >= {(0, 0), (1, 1)}
+    for fork, (k, light, _) in forks:
+        assert off_px(track, fork, sights[1])[k, light] < 2.0
 
 
 def test_lights_of_a_picture_share_the_error_of_its_stamp() -> None:
