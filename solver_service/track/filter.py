@@ -52,6 +52,9 @@ SHARE_TO_DOUBT: Final = 0.2
 LATE_BARS: Final = 8
 LONE_S: Final = 1.0
 BARS_TO_FOLLOW: Final = 25
+# A start without a fix that is not confirmed, and has the place so many times less exactly than a fix that agrees with
+# it, gives way to that. A wide one would agree with every fix, and nothing else would start.
+WIDER: Final = 3.0
 # A rival that began so much later than the best is younger.
 LATE_S: Final = 0.1
 # A confirmed track ends when no light was used for so long, and its position's sigma exceeds this share of the range,
@@ -222,8 +225,12 @@ class TrackFilter(TrackPool):
     def _take_fix(self, t_s: float, fix: FixSeen) -> None:
         self._fix_s = t_s
         agreed = False
+        wide: list[Estimate] = []
         for estimate in self._estimates():
             chi2 = self._gap_chi2(estimate, t_s, fix)
+            if chi2 < CONTRADICTS and self._gives_way(estimate, fix):
+                wide.append(estimate)
+                continue
             if chi2 < CONTRADICTS:
                 estimate.gap_chi2 += (1.0 - MEAN_KEPT) * (chi2 - estimate.gap_chi2)
             if chi2 < CONTRADICTS and estimate.gap_chi2 < MEAN_CONTRADICTS:
@@ -233,9 +240,12 @@ class TrackFilter(TrackPool):
                 estimate.contradicted = 0
             else:
                 estimate.contradicted += 1
-        if agreed:
+        started = None if agreed else self._start(t_s, fix)
+        if started is None and not agreed:
             return
-        started = self._start(t_s, fix)
+        self.challengers = [one for one in self.challengers if one not in wide]
+        if self.main in wide:
+            self.main = None
         if started is None:
             return
         if self.main is None:
@@ -246,6 +256,13 @@ class TrackFilter(TrackPool):
             started.detection = self.main.detection.copy()
             self.challengers.append(started)
             self.challengers = self.challengers[-3:]
+
+    @staticmethod
+    def _gives_way(estimate: Estimate, fix: FixSeen) -> bool:
+        if not estimate.searched or estimate.confirmed:
+            return False
+        place = place_covariance(estimate.state, estimate.covariance)
+        return float(place.trace()) > WIDER**2 * float(fix.covariance[:3, :3].trace())
 
     def _gap_chi2(self, estimate: Estimate, t_s: float, fix: FixSeen) -> float:
         """Return chi^2 (of 6) of the difference between a fix and the predicted pose."""

@@ -148,9 +148,7 @@ def test_a_young_start_that_follows_single_lights_is_not_told() -> None:
 @pytest.mark.slow
 def test_a_start_with_both_compasses_off_takes_the_lamp_that_is_lit() -> None:
     """Their headings are 17 degrees apart: the dark lamp was nearer to where one linear step put the lit one."""
-    scenario = Scenario(
-        ENVIRONMENTS[0], seed=1015, start_ns=EPOCH_NS, inertial="poor", dead_lamps=("a.right",)
-    )
+    scenario = Scenario(ENVIRONMENTS[0], seed=1015, start_ns=EPOCH_NS, inertial="poor", dead_lamps=("a.right",))
     wrong, share = simulated(scenario, 40.0, "filter")
     assert wrong == 0
     assert share > 0.7
