@@ -15,12 +15,13 @@ from buddyline.solver_service.track.estimate import Estimate, alike, lead
 from buddyline.solver_service.track.forecasts import TOGETHER, DueRow, Forecast, Way, make_rows, of_state
 from buddyline.solver_service.track.inputs import AttitudeSeen, FixSeen, TrackNode
 from buddyline.solver_service.track.intake import newest_before
-from buddyline.solver_service.track.lights import BLOCK, Sight
-from buddyline.solver_service.track.moving import HOLD_S, excerpt
-from buddyline.solver_service.track.output import CONTRADICTS, TrackRow, fix_chi2
+from buddyline.solver_service.track.lights import BLOCK, COLUMNS, Sight
+from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S, excerpt
+from buddyline.solver_service.track.output import CONTRADICTS, TrackRow, fix_chi2, fix_residual
 from buddyline.solver_service.track.pool import MAX_TENTATIVE, TrackPool
+from buddyline.solver_service.track.seeing import ONE_TRIGGER_S
 from buddyline.solver_service.track.start import CLOCK_S, state_from_fix
-from buddyline.solver_service.track.state import CLOCK, State, place_covariance
+from buddyline.solver_service.track.state import CLOCK, SIZE, State, place_covariance
 from buddyline.solver_service.track.stepping import TICK_S
 from buddyline.solver_service.track.strapdown import kept_shares
 
@@ -52,8 +53,9 @@ SHARE_TO_DOUBT: Final = 0.2
 LATE_BARS: Final = 8
 LONE_S: Final = 1.0
 BARS_TO_FOLLOW: Final = 25
-# A start without a fix that is not confirmed, and has the place so many times less exactly than a fix that agrees with
-# it, gives way to that. A wide one would agree with every fix, and nothing else would start.
+# What is not confirmed, and has the place so many times less exactly than a fix that agrees with it, cannot tell its
+# lights from others. If it started without a fix, it gives way to this one: it would agree with every fix, and nothing
+# else would start. If it started from a fix, this one tells it where it is, and how fast.
 WIDER: Final = 3.0
 # A rival that began so much later than the best is younger.
 LATE_S: Final = 0.1
@@ -228,13 +230,15 @@ class TrackFilter(TrackPool):
         wide: list[Estimate] = []
         for estimate in self._estimates():
             chi2 = self._gap_chi2(estimate, t_s, fix)
-            if chi2 < CONTRADICTS and self._gives_way(estimate, fix):
+            if chi2 < CONTRADICTS and estimate.searched and self._is_wide(estimate, fix):
                 wide.append(estimate)
                 continue
             if chi2 < CONTRADICTS:
                 estimate.gap_chi2 += (1.0 - MEAN_KEPT) * (chi2 - estimate.gap_chi2)
             if chi2 < CONTRADICTS and estimate.gap_chi2 < MEAN_CONTRADICTS:
                 agreed = True
+                if self._has_lost_the_lights(estimate, fix):
+                    self._take_as_measured(estimate, t_s, fix)
                 estimate.agreed_s = t_s
                 estimate.agreed += 1
                 estimate.contradicted = 0
@@ -258,11 +262,26 @@ class TrackFilter(TrackPool):
             self.challengers = self.challengers[-3:]
 
     @staticmethod
-    def _gives_way(estimate: Estimate, fix: FixSeen) -> bool:
-        if not estimate.searched or estimate.confirmed:
-            return False
+    def _is_wide(estimate: Estimate, fix: FixSeen) -> bool:
         place = place_covariance(estimate.state, estimate.covariance)
-        return float(place.trace()) > WIDER**2 * float(fix.covariance[:3, :3].trace())
+        return not estimate.confirmed and float(place.trace()) > WIDER**2 * float(fix.covariance[:3, :3].trace())
+
+    def _has_lost_the_lights(self, estimate: Estimate, fix: FixSeen) -> bool:
+        """Whether a start could use no light of its last two pictures, and is wide."""
+        unused = [t_s for t_s, _ in estimate.course[-2:] if t_s > estimate.light_s]
+        return len(unused) == 2 and self._is_wide(estimate, fix)
+
+    def _take_as_measured(self, estimate: Estimate, t_s: float, fix: FixSeen) -> None:
+        """Update an estimate by a fix in place of its trigger's lights."""
+        if t_s - estimate.t_s > TOGETHER_S:
+            self._step(estimate, t_s, None)
+        y, J, noise = fix_residual(estimate.state, estimate.rates_radps, fix)
+        H = np.zeros((len(y), SIZE))
+        H[:, COLUMNS] = J
+        self._apply(estimate, H, y, noise)
+        self._amend_step(estimate)
+        estimate.light_s = t_s
+        estimate.skip_s = t_s - estimate.start_s + ONE_TRIGGER_S
 
     def _gap_chi2(self, estimate: Estimate, t_s: float, fix: FixSeen) -> float:
         """Return chi^2 (of 6) of the difference between a fix and the predicted pose."""

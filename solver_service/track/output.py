@@ -86,14 +86,19 @@ def pose_jacobian(now: State) -> Floats:
     return J
 
 
-def fix_chi2(state: State, P: Floats, rates_radps: Floats, fix: FixSeen) -> float:
-    """Give chi^2 (of 6) of the difference between a fix and a state with the covariance P (C, C) of COLUMNS."""
+def fix_residual(state: State, rates_radps: Floats, fix: FixSeen) -> tuple[Floats, Floats, Floats]:
+    """Give by what (6,) a fix differs from a state, its Jacobian (6, C) by COLUMNS, and the fix's noise (6, 6)."""
     now = at_one_time(state, rates_radps)
     J = (pose_jacobian(now) @ at_one_time_jacobian(state, rates_radps))[:6]
     toward = now.R[0].T
     gap = np.concatenate((fix.t_a_b_m - toward @ now.r_m, rotation_log(fix.R_a_b @ (toward @ now.R[1]).T)))
-    S = J @ P @ J.T + fix.covariance + np.diag([1e-4] * 3 + [1e-5] * 3)
-    return float(gap @ np.linalg.solve(S, gap))
+    return gap, J, fix.covariance + np.diag([1e-4] * 3 + [1e-5] * 3)
+
+
+def fix_chi2(state: State, P: Floats, rates_radps: Floats, fix: FixSeen) -> float:
+    """Give chi^2 (of 6) of the difference between a fix and a state with the covariance P (C, C) of COLUMNS."""
+    gap, J, noise = fix_residual(state, rates_radps, fix)
+    return float(gap @ np.linalg.solve(J @ P @ J.T + noise, gap))
 
 
 def _bent(C: Floats) -> Floats:

@@ -274,8 +274,7 @@ class TrackPool(TrackSteps):
                 self._update_lights(child, Association(chosen, np.ones(2), 0.0), near_y, near_H, sight)
                 child.used[sight.node, sight.stamp_ns] = chosen
                 child.looks_away[sight.node] = False
-                if child.steps:
-                    child.steps.last = replace(child.steps.last, after=child.state.row, covariance=child.covariance)
+                self._amend_step(child)
                 self.challengers.append(child)
 
     def _force(self, estimate: Estimate, sight: Sight, chosen: Chosen) -> None:

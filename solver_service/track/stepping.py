@@ -107,6 +107,13 @@ class TrackSteps(TrackSights):
         if turn is not None:
             estimate.steps.last = turn.added_to_step(estimate.steps.last)
 
+    @staticmethod
+    def _amend_step(estimate: Estimate) -> None:
+        """Put an estimate as it is now into its last step."""
+        if estimate.steps:
+            last = estimate.steps.last
+            estimate.steps.last = replace(last, after=estimate.state.row, covariance=estimate.covariance)
+
     def increments(self, estimate: Estimate, t_s: float) -> Increments:
         """Integrate both nodes from the estimate's time to t_s; in a pass, together with later steps."""
         if not (self.passes and estimate.confirmed) or any(estimate.without):

@@ -70,6 +70,14 @@ def test_a_wide_start_without_a_fix_gives_way_to_a_fix() -> None:
     assert figures.wrong == 0
 
 
+@pytest.mark.parametrize(("seed", "water"), [(9301, "basin"), (9303, "cavern"), (9308, "lake")])
+def test_the_next_fix_tells_a_start_that_cannot_find_the_lights(seed: int, water: Environment) -> None:
+    """A third of a second after a fix nothing says where a diver without a unit has swum: every light is doubtful."""
+    rows, figures = live(seed, None, water, 3.0)
+    assert rows[0].stamp_ns - EPOCH_NS < 2 * S_NS
+    assert figures.wrong == 0
+
+
 def test_rows_end_with_the_last_message() -> None:
     """Without inertial units a track could go on by itself, and the nodes turn as nobody told."""
     rows, _ = live(22032, None)
