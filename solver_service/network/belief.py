@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -35,12 +35,24 @@ from buddyline.solver_service.network.trail import Chosen, Grown, Learned, NetTr
 from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, TrackNode
 from buddyline.solver_service.track.intake import TrackIntake, newest_before
-from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S, WITHOUT_RAD, WITHOUT_RADPS, excerpt, increments
+from buddyline.solver_service.track.moving import (
+    AWAY_RATE,
+    HOLD_S,
+    TOGETHER_S,
+    WITHOUT_RAD,
+    WITHOUT_RADPS,
+    excerpt,
+    increments,
+    sudden_rate,
+)
 from buddyline.solver_service.track.stepping import ATTITUDE_EVERY_S, TICK_S
 from buddyline.solver_service.track.strapdown import Noise
 
 # With fixed nodes the heading of an attitude gets this factor: it does not count.
 FREE_HEADING: Final = 1e6
+# How fast an attitude's slow error changes, as a share of its stated sigma per root s: as tracks of single pairs learn
+# it (0.44 to 0.50 on five dives without inertial units).
+WANDER: Final = 0.5
 # All gauges are used together once the datum is known better than this, 1 sd.
 KNOWN_DATUM_M: Final = 10.0
 
@@ -61,6 +73,7 @@ class Member:
 
     light_s: time of the last light that was used of it, or in its pictures. skip_s: earlier lights are not used, for
     they made it a member. evidence: log odds over clutter since it joined. without: it has no inertial unit now.
+    turning_off (3,), looks_away: as in the track's estimate, of its own turning and its own pictures.
     """
 
     node: int
@@ -72,6 +85,8 @@ class Member:
     attitude_s: float = -np.inf
     depth_s: float = -np.inf
     without: bool = False
+    turning_off: Floats = field(default_factory=lambda: np.zeros(3))
+    looks_away: bool = False
 
 
 class NetBelief:
@@ -194,13 +209,17 @@ class NetBelief:
 
     # Motion
 
-    def _noise_of(self, node: int, t_s: float) -> Noise:
-        noise = self.intake.samples[node].noise(t_s)
+    def _noise_of(self, member: Member, t_s: float) -> Noise:
+        noise = self.intake.samples[member.node].noise(t_s)
         if self.walked != 1.0:
             gyro, accel = self.walked * noise.gyro_bias_radps, self.walked * noise.accel_bias_mps2
             noise = replace(noise, gyro_bias_radps=gyro, accel_bias_mps2=accel)
-        stated = self.intake.turning[node].stated(t_s)
-        return noise if stated is None else replace(noise, gap_tilt_rad=stated[0], gap_heading_rad=stated[1])
+        if member.looks_away:
+            noise = replace(noise, gap_rate_radps=max(noise.gap_rate_radps, AWAY_RATE))
+        stated = self.intake.turning[member.node].stated(t_s)
+        if stated is None:
+            return noise
+        return replace(noise, gap_tilt_rad=WANDER * stated[0], gap_heading_rad=WANDER * stated[1])
 
     @property
     def _moving(self) -> list[int]:
@@ -218,9 +237,16 @@ class NetBelief:
             nodes = [self.members[i].node for i in moving]
             of_moving = state if len(moving) == n else state.chosen(moving)
             parts = increments([self.intake.samples[node] for node in nodes], of_moving, self.t_s, to_s)
-            noises = [self._noise_of(node, to_s) for node in nodes]
+            noises = [self._noise_of(self.members[i], to_s) for i in moving]
             shaking = self.shaking.variances[moving]
             after, *step = moved_members(of_moving, parts, noises, shaking, to_s - self.t_s)
+            turned = self._turned_suddenly(moving, after, step[0], step[1], to_s)
+            if any(turned):
+                noises = [
+                    replace(noise, gap_rate_radps=max(noise.gap_rate_radps, rate))
+                    for noise, rate in zip(noises, turned, strict=True)
+                ]
+                after, *step = moved_members(of_moving, parts, noises, shaking, to_s - self.t_s)
             F[moving], Q[moving], drawn[moving] = step
             rates[moving] = parts.rate_radps
             state = after if len(moving) == n else state.replaced(moving, after)
@@ -230,11 +256,35 @@ class NetBelief:
                     # The unit has stopped, or come back: these errors now stand for something else, and are unknown.
                     Q[i, GYRO_BIAS, GYRO_BIAS] += WITHOUT_RADPS**2 * np.eye(3)
                     Q[i, MOUNT, MOUNT] += WITHOUT_RAD**2 * np.eye(3)
+                    stated = self.intake.turning[self.members[i].node].stated(to_s)
+                    if now and stated is not None:
+                        # Now the mount's place has the heading's slow error, which may be all of what is stated.
+                        Q[i, MOUNT.stop - 1, MOUNT.stop - 1] += stated[1] ** 2
         if self.anchor is None:
             return state, Move(F, Q), rates, without, drawn
         p, v = state.p_m[self.anchor], state.v_mps[self.anchor]
         state = replace(state, p_m=state.p_m - p, v_mps=state.v_mps - v)
         return state, Move(F, Q, self.anchor, p, v), rates, without, drawn
+
+    def _turned_suddenly(self, moving: list[int], after: NetState, F: Floats, Q: Floats, to_s: float) -> list[float]:
+        """Give how much the turn rates (m,) of members walk in a step to to_s because their attitudes ask for it.
+
+        after: the moving members after the step; F, Q (m, BLOCK, BLOCK): their step. 0 with a unit, or without a turn.
+        """
+        rates = [0.0] * len(moving)
+        for k, index in enumerate(moving):
+            member = self.members[index]
+            near = self.intake.turning[member.node].at(to_s, to_s + HOLD_S) if member.without else None
+            if near is None:
+                continue
+            R_level_camera, variances = near
+            y = rotation_log(R_level_camera @ after.R[k].T) - after.mount_rad[k]
+            own = F[k] @ self.covariance[block(index), block(index)] @ F[k].T + Q[k]
+            H = np.zeros((3, BLOCK))
+            H[:, PHI] = H[:, MOUNT] = np.eye(3)
+            S = H @ own @ H.T + (R_level_camera * variances) @ R_level_camera.T
+            rates[k], member.turning_off = sudden_rate(y, S, member.turning_off, to_s - self.t_s)
+        return rates
 
     def _way(self, to_s: float) -> NetWay:
         """Give what leads to the state at to_s, without going there."""
@@ -245,7 +295,7 @@ class NetBelief:
             excerpt(self.intake.samples[node], delay_s, self.t_s, to_s)
             for node, delay_s in zip(nodes, delays_s, strict=True)
         ]
-        noises = [self._noise_of(node, to_s) for node in nodes]
+        noises = [self._noise_of(self.members[i], to_s) for i in moving]
         return NetWay(to_s - self.t_s, moving, samples, noises, self.shaking.variances[moving])
 
     def step(self, t_s: float) -> None:

@@ -110,6 +110,8 @@ class NetEstimate(NetBelief):
             return
         self.step(t_s)
         seen = [(index, sight) for sight in sights if (index := self.member_of(sight.node)) is not None]
+        for index, _ in seen:
+            self.members[index].looks_away = True
         if seen:
             self._take_lights(seen)
             self._judge()
@@ -220,6 +222,7 @@ class NetEstimate(NetBelief):
         for bar in (bars[one] for one, *_ in chosen):
             for member in (self.members[bar.other], self.members[bar.observer]):
                 member.light_s = max(member.light_s, bar.sight.t_s)
+            self.members[bar.observer].looks_away = False
         counted = variances * [self._alike(bars[bar], candidate, of) for bar, candidate, of, _ in chosen]
         noise = noise_of(counted, H[n, k, light, :, -1], np.array([id(bars[one].sight) for one in n]))
         self._apply(rows.reshape(2 * len(chosen), -1), y[n, k, light].ravel(), noise, teaches=True)

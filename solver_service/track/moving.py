@@ -125,6 +125,19 @@ def increments(
     return integrated(state, found, by_shares=by_shares and any(samples.parted for samples in of_nodes))
 
 
+def sudden_rate(y: Floats, S: Floats, turning_off: Floats, span_s: float) -> tuple[float, Floats]:
+    """Give how much the turn rate walks in a step of span_s (rad/s per root s), by an attitude's residual y (3,) of the
+    covariance S (3, 3): 0 where there is no sign of a sudden turn.
+
+    turning_off (3,): the lasting part of earlier residuals, in sigmas; it is returned for the next.
+    """
+    whitened = np.linalg.solve(np.linalg.cholesky(S), y)
+    lasting = whitened + LASTING * turning_off
+    if max(float(whitened @ whitened), float(lasting @ lasting) / SUMMED) < STARTLED:
+        return 0.0, lasting
+    return min(math.sqrt(float(y @ y) / max(span_s, TOGETHER_S) ** 3), MOST_GAP_RATE), np.zeros(3)
+
+
 def _padded(rows: Sequence[NDArray[Number]]) -> NDArray[Number]:
     """Give nodes' rows (N, M, ...), the last one repeated where another node has more: intervals of no length."""
     most = max(map(len, rows))
@@ -271,14 +284,8 @@ class TrackMoves(TrackIntake):
         walks = (noise.gap_tilt_rad, noise.gap_tilt_rad, noise.gap_heading_rad)
         S = H @ estimate.covariance @ H.T + np.diag(np.square(walks) * span_s)
         S += noise.gap_rate_radps**2 * span_s**3 / 3.0 * np.eye(3) + (R_level_camera * variances) @ R_level_camera.T
-        whitened = np.linalg.solve(np.linalg.cholesky(S), y)
-        lasting = whitened + LASTING * estimate.turning_off[node]
-        estimate.turning_off[node] = lasting
-        if max(float(whitened @ whitened), float(lasting @ lasting) / SUMMED) < STARTLED:
-            return noise
-        estimate.turning_off[node] = np.zeros(3)
-        rate = math.sqrt(float(y @ y) / max(span_s, TOGETHER_S) ** 3)
-        return replace(noise, gap_rate_radps=max(noise.gap_rate_radps, min(rate, MOST_GAP_RATE)))
+        rate, estimate.turning_off[node] = sudden_rate(y, S, estimate.turning_off[node], span_s)
+        return replace(noise, gap_rate_radps=max(noise.gap_rate_radps, rate))
 
     def _predict(self, estimate: Estimate, t_s: float) -> tuple[State, Floats]:
         """Return state and covariance at t_s, within TOGETHER_S those of now."""

@@ -19,6 +19,7 @@ from buddyline.solver_service.network import filter as filter_module
 from buddyline.solver_service.network.estimate import NetEstimate
 from buddyline.solver_service.network.filter import NetFilter
 from buddyline.solver_service.tracking import Coming, PairTracker
+from buddyline.tools.evaluation.network import network_figures
 from msgspec.structs import replace
 
 START_NS = 1_764_000_000_000_000_000
@@ -198,6 +199,21 @@ def test_without_a_fixed_node_the_frame_moves_with_one() -> None:
     assert sorted(found) == ["a", "b", "c", "d"]
     # Only the compasses say where north is.
     assert all(rows[:, 0].max() < 1.0 and rows[:, 2].mean() < 2.0 for rows in found.values())
+
+
+@pytest.mark.slow
+def test_nodes_without_inertial_units_are_followed_when_they_turn_away() -> None:
+    """Their compasses tell a turn late: the network lost its members, or was metres off."""
+    judged = []
+    for seed in (12, 14):
+        world, messages = dive(seed, 30.0, more_nodes=("c",), fixed_nodes=(), imu=False)
+        poses, _ = solved(messages)
+        judged += network_figures(poses, [world.node_truth(pose.node, pose.stamp_ns, "main") for pose in poses])
+    assert len(judged) == 6
+    assert sum(one.wrong for one in judged) == 0
+    # Of 300 triggers; half of the nodes had 112 to 166 rows.
+    assert min(one.samples for one in judged) > 250
+    assert max(one.nees6.mean or 0.0 for one in judged) < 1.5 * 6.0
 
 
 def test_a_fixed_node_that_comes_after_the_others_holds_the_frame(
