@@ -55,6 +55,9 @@ FREE_HEADING: Final = 1e6
 WANDER: Final = 0.5
 # All gauges are used together once the datum is known better than this, 1 sd.
 KNOWN_DATUM_M: Final = 10.0
+# How a node's errors move its attitude without an inertial unit: its own, and the slow error in the mount's place.
+_ATTITUDE: Final = np.zeros((3, BLOCK))
+_ATTITUDE[:, PHI] = _ATTITUDE[:, MOUNT] = np.eye(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,15 +259,20 @@ class NetBelief:
                     # The unit has stopped, or come back: these errors now stand for something else, and are unknown.
                     Q[i, GYRO_BIAS, GYRO_BIAS] += WITHOUT_RADPS**2 * np.eye(3)
                     Q[i, MOUNT, MOUNT] += WITHOUT_RAD**2 * np.eye(3)
-                    stated = self.intake.turning[self.members[i].node].stated(to_s)
-                    if now and stated is not None:
-                        # Now the mount's place has the heading's slow error, which may be all of what is stated.
-                        Q[i, MOUNT.stop - 1, MOUNT.stop - 1] += stated[1] ** 2
+                    if now:
+                        # Now the mount's place has the heading's slow error.
+                        Q[i, MOUNT.stop - 1, MOUNT.stop - 1] += self._heading_rad(self.members[i].node, to_s) ** 2
         if self.anchor is None:
             return state, Move(F, Q), rates, without, drawn
         p, v = state.p_m[self.anchor], state.v_mps[self.anchor]
         state = replace(state, p_m=state.p_m - p, v_mps=state.v_mps - v)
         return state, Move(F, Q, self.anchor, p, v), rates, without, drawn
+
+    def _heading_rad(self, node: int, t_s: float) -> float:
+        """Give by how much (1 sd) a node's compass may be off the frame's north: all of what is stated may be its slow
+        error, and the north of fixed nodes may be anywhere."""
+        stated = self.intake.turning[node].stated(t_s)
+        return math.pi if self.places else stated[1] if stated is not None else 0.0
 
     def _turned_suddenly(self, moving: list[int], after: NetState, F: Floats, Q: Floats, to_s: float) -> list[float]:
         """Give how much the turn rates (m,) of members walk in a step to to_s because their attitudes ask for it.
@@ -274,17 +282,27 @@ class NetBelief:
         rates = [0.0] * len(moving)
         for k, index in enumerate(moving):
             member = self.members[index]
-            near = self.intake.turning[member.node].at(to_s, to_s + HOLD_S) if member.without else None
-            if near is None:
+            told = self._turning_residual(member, to_s, after.R[k], after.mount_rad[k])
+            if told is None:
                 continue
-            R_level_camera, variances = near
-            y = rotation_log(R_level_camera @ after.R[k].T) - after.mount_rad[k]
+            y, noise = told
             own = F[k] @ self.covariance[block(index), block(index)] @ F[k].T + Q[k]
-            H = np.zeros((3, BLOCK))
-            H[:, PHI] = H[:, MOUNT] = np.eye(3)
-            S = H @ own @ H.T + (R_level_camera * variances) @ R_level_camera.T
+            S = _ATTITUDE @ own @ _ATTITUDE.T + noise
             rates[k], member.turning_off = sudden_rate(y, S, member.turning_off, to_s - self.t_s)
         return rates
+
+    def _turning_residual(
+        self, member: Member, t_s: float, R: Floats, mount_rad: Floats
+    ) -> tuple[Floats, Floats] | None:
+        """Give how far (3,) a node's attitude is off R (3, 3) and its slow error mount_rad (3,), and its noise (3, 3).
+
+        None where there is no attitude, or the node has an inertial unit, which tells more.
+        """
+        near = self.intake.turning[member.node].at(t_s, t_s + HOLD_S) if member.without else None
+        if near is None:
+            return None
+        R_level_camera, variances = near
+        return rotation_log(R_level_camera @ R.T) - mount_rad, (R_level_camera * variances) @ R_level_camera.T
 
     def _way(self, to_s: float) -> NetWay:
         """Give what leads to the state at to_s, without going there."""
@@ -398,15 +416,13 @@ class NetBelief:
 
     def _take_turning(self, index: int, member: Member) -> None:
         """Update a node without an inertial unit by its attitude, which may be off by a slow error."""
-        near = self.intake.turning[member.node].at(self.t_s, self.t_s + HOLD_S) if member.without else None
-        if near is None:
-            return
         assert self.state is not None
-        R_level_camera, variances = near
-        y, H = self._attitude_residual(index, R_level_camera)
-        y = y - self.state.mount_rad[index]
-        H[:, block(index)][:, MOUNT] = np.eye(3)
-        noise = (R_level_camera * variances) @ R_level_camera.T
+        told = self._turning_residual(member, self.t_s, self.state.R[index], self.state.mount_rad[index])
+        if told is None:
+            return
+        y, noise = told
+        H = np.zeros((3, len(self.covariance)))
+        H[:, block(index)] = _ATTITUDE
         if float(y @ np.linalg.solve(noise + H @ self.covariance @ H.T, y)) < 30.0:
             self._apply(H, y, noise)
 

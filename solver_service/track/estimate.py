@@ -49,10 +49,10 @@ class Estimate:
     contradicted: how many since then did not; gap_chi2: the running mean of the fixes' chi^2.
 
     Its life: searched: it started without a fix; lone: from single lamps. skip_s: pictures within this after start_s
-    made it, and tell nothing new. patience_s: how long it may stay unconfirmed. end_s: later pictures are not its own.
-    course: the evidence over time, used: the lights of each picture, by node and stamp; both while it is not confirmed.
-    given: the lights to use where that is decided. saw: node of the lamps, time and last_seen of each picture while it
-    is not confirmed.
+    made it, or a fix that it took in their place, and tell nothing new. patience_s: how long it may stay unconfirmed.
+    end_s: later pictures are not its own. course: the evidence over time, used: the lights of each picture, by node
+    and stamp; both while it is not confirmed. given: the lights to use where that is decided. saw: node of the lamps,
+    time and last_seen of each picture while it is not confirmed.
     """
 
     t_s: float

@@ -53,9 +53,10 @@ SHARE_TO_DOUBT: Final = 0.2
 LATE_BARS: Final = 8
 LONE_S: Final = 1.0
 BARS_TO_FOLLOW: Final = 25
-# What is not confirmed, and has the place so many times less exactly than a fix that agrees with it, cannot tell its
-# lights from others. If it started without a fix, it gives way to this one: it would agree with every fix, and nothing
-# else would start. If it started from a fix, this one tells it where it is, and how fast.
+# A start that has the place so many times less exactly than a fix that agrees with it may not tell its lights from
+# others. A start without a fix is dropped then, and the fix makes a new one: the wide one would agree with every fix,
+# and nothing else would start. But one that has proved itself, and used a light just now, stays. A start from a fix
+# that could use no light takes the new fix as a measurement.
 WIDER: Final = 3.0
 # A rival that began so much later than the best is younger.
 LATE_S: Final = 0.1
@@ -227,17 +228,18 @@ class TrackFilter(TrackPool):
     def _take_fix(self, t_s: float, fix: FixSeen) -> None:
         self._fix_s = t_s
         agreed = False
-        wide: list[Estimate] = []
+        lost: list[Estimate] = []
         for estimate in self._estimates():
-            chi2 = self._gap_chi2(estimate, t_s, fix)
-            if chi2 < CONTRADICTS and estimate.searched and self._is_wide(estimate, fix):
-                wide.append(estimate)
+            chi2, wide = self._compared_with(estimate, t_s, fix)
+            unused = wide and self._used_none(estimate)
+            if chi2 < CONTRADICTS and estimate.searched and wide and (unused or estimate.evidence < CONFIRMED):
+                lost.append(estimate)
                 continue
             if chi2 < CONTRADICTS:
                 estimate.gap_chi2 += (1.0 - MEAN_KEPT) * (chi2 - estimate.gap_chi2)
             if chi2 < CONTRADICTS and estimate.gap_chi2 < MEAN_CONTRADICTS:
                 agreed = True
-                if self._has_lost_the_lights(estimate, fix):
+                if unused:
                     self._take_as_measured(estimate, t_s, fix)
                 estimate.agreed_s = t_s
                 estimate.agreed += 1
@@ -247,8 +249,8 @@ class TrackFilter(TrackPool):
         started = None if agreed else self._start(t_s, fix)
         if started is None and not agreed:
             return
-        self.challengers = [one for one in self.challengers if one not in wide]
-        if self.main in wide:
+        self.challengers = [one for one in self.challengers if one not in lost]
+        if self.main in lost:
             self.main = None
         if started is None:
             return
@@ -261,32 +263,34 @@ class TrackFilter(TrackPool):
             self.challengers.append(started)
             self.challengers = self.challengers[-3:]
 
-    @staticmethod
-    def _is_wide(estimate: Estimate, fix: FixSeen) -> bool:
-        place = place_covariance(estimate.state, estimate.covariance)
-        return not estimate.confirmed and float(place.trace()) > WIDER**2 * float(fix.covariance[:3, :3].trace())
+    def _compared_with(self, estimate: Estimate, t_s: float, fix: FixSeen) -> tuple[float, bool]:
+        """Give chi^2 (of 6) of how far a fix is off an estimate, and whether that is not confirmed, and wide."""
+        state, P = self._predict(estimate, t_s)
+        place, of_fix = place_covariance(state, P), fix.covariance[:3, :3]
+        wide = not estimate.confirmed and float(place.trace()) > WIDER**2 * float(of_fix.trace())
+        return fix_chi2(state, P[BLOCK], estimate.rates_radps, fix), wide
 
-    def _has_lost_the_lights(self, estimate: Estimate, fix: FixSeen) -> bool:
-        """Whether a start could use no light of its last two pictures, and is wide."""
-        unused = [t_s for t_s, _ in estimate.course[-2:] if t_s > estimate.light_s]
-        return len(unused) == 2 and self._is_wide(estimate, fix)
+    @staticmethod
+    def _used_none(estimate: Estimate) -> bool:
+        """Whether what is not confirmed could use no light of its last two pictures."""
+        return sum(t_s > estimate.light_s for t_s, _ in estimate.course[-2:]) == 2
 
     def _take_as_measured(self, estimate: Estimate, t_s: float, fix: FixSeen) -> None:
-        """Update an estimate by a fix in place of its trigger's lights."""
+        """Update a start by a fix in place of its trigger's lights; it is a start from this fix then.
+
+        That it agreed with this one, and with those before, says nothing: it was too wide. What is learned of shaking
+        is of lights alone, and stays.
+        """
         if t_s - estimate.t_s > TOGETHER_S:
             self._step(estimate, t_s, None)
         y, J, noise = fix_residual(estimate.state, estimate.rates_radps, fix)
         H = np.zeros((len(y), SIZE))
         H[:, COLUMNS] = J
         self._apply(estimate, H, y, noise)
-        self._amend_step(estimate)
+        estimate.agreed = 0
         estimate.light_s = t_s
         estimate.skip_s = t_s - estimate.start_s + ONE_TRIGGER_S
-
-    def _gap_chi2(self, estimate: Estimate, t_s: float, fix: FixSeen) -> float:
-        """Return chi^2 (of 6) of the difference between a fix and the predicted pose."""
-        state, P = self._predict(estimate, t_s)
-        return fix_chi2(state, P[BLOCK], estimate.rates_radps, fix)
+        self._amend_step(estimate)
 
     def _start(self, t_s: float, fix: FixSeen) -> Estimate | None:
         attitudes = [newest_before(of_node, t_s + HOLD_S) for of_node in self.attitudes]

@@ -77,15 +77,7 @@ class TrackSteps(TrackSights):
             return
         estimate.steps.drop_before(t_s - self._keep_s)
         if together:
-            last = estimate.steps.last
-            estimate.steps.last = replace(
-                last,
-                after=estimate.state.row,
-                covariance=estimate.covariance,
-                light_s=estimate.light_s,
-                lights=estimate.lights,
-                looks=last.looks + looks,
-            )
+            self._amend_step(estimate, looks)
         else:
             estimate.steps.append(
                 Step(
@@ -108,11 +100,18 @@ class TrackSteps(TrackSights):
             estimate.steps.last = turn.added_to_step(estimate.steps.last)
 
     @staticmethod
-    def _amend_step(estimate: Estimate) -> None:
-        """Put an estimate as it is now into its last step."""
+    def _amend_step(estimate: Estimate, looks: tuple[Look, ...] = ()) -> None:
+        """Put an estimate as it is now, and what more pictures have told, into its last step, if it keeps steps."""
         if estimate.steps:
             last = estimate.steps.last
-            estimate.steps.last = replace(last, after=estimate.state.row, covariance=estimate.covariance)
+            estimate.steps.last = replace(
+                last,
+                after=estimate.state.row,
+                covariance=estimate.covariance,
+                light_s=estimate.light_s,
+                lights=estimate.lights,
+                looks=last.looks + looks,
+            )
 
     def increments(self, estimate: Estimate, t_s: float) -> Increments:
         """Integrate both nodes from the estimate's time to t_s; in a pass, together with later steps."""
