@@ -260,7 +260,7 @@ class NetBelief:
                     Q[i, GYRO_BIAS, GYRO_BIAS] += WITHOUT_RADPS**2 * np.eye(3)
                     Q[i, MOUNT, MOUNT] += WITHOUT_RAD**2 * np.eye(3)
                     if now:
-                        # Now the mount's place has the heading's slow error.
+                        # From now on the mount's place holds the compass's slow error.
                         Q[i, MOUNT.stop - 1, MOUNT.stop - 1] += self._heading_rad(self.members[i].node, to_s) ** 2
         if self.anchor is None:
             return state, Move(F, Q), rates, without, drawn
@@ -269,15 +269,18 @@ class NetBelief:
         return state, Move(F, Q, self.anchor, p, v), rates, without, drawn
 
     def _heading_rad(self, node: int, t_s: float) -> float:
-        """Give by how much (1 sd) a node's compass may be off the frame's north: all of what is stated may be its slow
-        error, and the north of fixed nodes may be anywhere."""
+        """Give 1 sd of the slow error of a node's compass against the frame's north.
+
+        All of the stated sigma may be slow error. The north of fixed nodes' frame may be anywhere.
+        """
         stated = self.intake.turning[node].stated(t_s)
         return math.pi if self.places else stated[1] if stated is not None else 0.0
 
     def _turned_suddenly(self, moving: list[int], after: NetState, F: Floats, Q: Floats, to_s: float) -> list[float]:
-        """Give how much the turn rates (m,) of members walk in a step to to_s because their attitudes ask for it.
+        """Give the random walk of each moving member's turn rate (m,) in a step to to_s, by its attitude.
 
-        after: the moving members after the step; F, Q (m, BLOCK, BLOCK): their step. 0 with a unit, or without a turn.
+        after: the moving members after the step. F, Q (m, BLOCK, BLOCK): their step. 0 for a member that has an
+        inertial unit, or shows no sudden turn.
         """
         rates = [0.0] * len(moving)
         for k, index in enumerate(moving):

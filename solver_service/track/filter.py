@@ -53,10 +53,11 @@ SHARE_TO_DOUBT: Final = 0.2
 LATE_BARS: Final = 8
 LONE_S: Final = 1.0
 BARS_TO_FOLLOW: Final = 25
-# A start that has the place so many times less exactly than a fix that agrees with it may not tell its lights from
-# others. A start without a fix is dropped then, and the fix makes a new one: the wide one would agree with every fix,
-# and nothing else would start. But one that has proved itself, and used a light just now, stays. A start from a fix
-# that could use no light takes the new fix as a measurement.
+# A start is wide where the sigma of its place is so many times that of a fix that agrees with it. A wide start cannot
+# be sure which candidates are lights. If it began without a fix, it is dropped, and the fix makes a new start: a wide
+# one can agree with every fix, and then nothing else would start. It stays if its evidence is above CONFIRMED and it
+# has used a light of the last two pictures. If it began from a fix and used no such light, it takes the new fix as a
+# measurement.
 WIDER: Final = 3.0
 # A rival that began so much later than the best is younger.
 LATE_S: Final = 0.1
@@ -264,7 +265,7 @@ class TrackFilter(TrackPool):
             self.challengers = self.challengers[-3:]
 
     def _compared_with(self, estimate: Estimate, t_s: float, fix: FixSeen) -> tuple[float, bool]:
-        """Give chi^2 (of 6) of how far a fix is off an estimate, and whether that is not confirmed, and wide."""
+        """Give chi^2 (of 6) of a fix against an estimate, and whether the estimate is an unconfirmed, wide start."""
         state, P = self._predict(estimate, t_s)
         place, of_fix = place_covariance(state, P), fix.covariance[:3, :3]
         wide = not estimate.confirmed and float(place.trace()) > WIDER**2 * float(of_fix.trace())
@@ -272,14 +273,14 @@ class TrackFilter(TrackPool):
 
     @staticmethod
     def _used_none(estimate: Estimate) -> bool:
-        """Whether what is not confirmed could use no light of its last two pictures."""
+        """Whether an unconfirmed estimate could use no light of its last two pictures."""
         return sum(t_s > estimate.light_s for t_s, _ in estimate.course[-2:]) == 2
 
     def _take_as_measured(self, estimate: Estimate, t_s: float, fix: FixSeen) -> None:
-        """Update a start by a fix in place of its trigger's lights; it is a start from this fix then.
+        """Update a wide start by a fix. The lights of the fix's trigger are not used again.
 
-        That it agreed with this one, and with those before, says nothing: it was too wide. What is learned of shaking
-        is of lights alone, and stays.
+        Fixes that have agreed so far do not count: a wide start agrees with any. Of shaking nothing is learned here;
+        only lights teach it.
         """
         if t_s - estimate.t_s > TOGETHER_S:
             self._step(estimate, t_s, None)

@@ -126,10 +126,10 @@ def increments(
 
 
 def sudden_rate(y: Floats, S: Floats, turning_off: Floats, span_s: float) -> tuple[float, Floats]:
-    """Give how much the turn rate walks in a step of span_s (rad/s per root s), by an attitude's residual y (3,) of the
-    covariance S (3, 3): 0 where there is no sign of a sudden turn.
+    """Give the random walk of a node's turn rate in a step of span_s, rad/s per root s: 0 without a sudden turn.
 
-    turning_off (3,): the lasting part of earlier residuals, in sigmas; it is returned for the next.
+    y (3,), S (3, 3): an attitude's residual and its covariance. turning_off (3,): the lasting part of the residuals
+    before, in sigmas; the second result is the same for the next step.
     """
     whitened = np.linalg.solve(np.linalg.cholesky(S), y)
     lasting = whitened + LASTING * turning_off

@@ -262,7 +262,7 @@ class TrackPool(TrackSteps):
                     continue
                 child = estimate.copied(unseen_by=None)
                 chosen = ((k, light, START_PX**2),)
-                # One linear step with a heading off by 17 degrees would end 22 px beside the light, with a sigma of 3.
+                # With a heading 17 degrees off, one linear step ends 22 px beside the light, with a sigma of 3 px.
                 near_y, near_H = self._about(child, sight, chosen, None)
                 if not in_front(chosen, near_y):
                     continue

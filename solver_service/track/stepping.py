@@ -101,7 +101,7 @@ class TrackSteps(TrackSights):
 
     @staticmethod
     def _amend_step(estimate: Estimate, looks: tuple[Look, ...] = ()) -> None:
-        """Put an estimate as it is now, and what more pictures have told, into its last step, if it keeps steps."""
+        """Write an estimate's present state into its last step, if it keeps steps. looks: of further pictures."""
         if estimate.steps:
             last = estimate.steps.last
             estimate.steps.last = replace(
