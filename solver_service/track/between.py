@@ -101,9 +101,9 @@ class Weights:
     def jacobians(self, before: State, after: State, between: State) -> tuple[Floats, Floats]:
         """Give the errors of COLUMNS of the states between by those before and after, (M, C, C) each.
 
-        This is of nodes with units, whose samples tell how they turn between two steps. So errors of attitudes go
-        straight from those of one step to those of the other, whatever the turn. (What white noise does is in
-        `_unseen`.) Plain errors of places and velocities add up by the weights. The state's own errors are a screw's
+        Samples, or the turn rates of both steps, tell how nodes turn between two steps. So errors of attitudes go
+        straight from those of one step to those of the other, whatever the turn. (What noise does is in `_unseen`.)
+        Plain errors of places and velocities add up by the weights. The state's own errors are a screw's
         (`State.plus`): T makes plain ones of them at both steps, and its inverse brings them back between.
         """
         back = invariant_of_plain(between)[:, :NAV, :NAV]

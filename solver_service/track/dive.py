@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import reduce
+from functools import partial, reduce
 from itertools import chain
 from typing import Final
 
@@ -42,7 +42,7 @@ from buddyline.solver_service.track.records import (
     stamp_of,
     until_one_ended,
 )
-from buddyline.solver_service.track.relax import PassedOver, PathPass, clock_sigma_s, settled
+from buddyline.solver_service.track.relax import PassedOver, PathPass, clock_sigma_s, contradicted_by, settled
 from buddyline.solver_service.track.smoother import Path, smoothed
 from buddyline.solver_service.track.start import CLOCK_S
 from buddyline.solver_service.track.vibration import Shares
@@ -165,10 +165,15 @@ def _unrest(parts: Sequence[Estimate]) -> float:
 
     Of lights whose errors last it does not: these do not show against a track that has the same errors.
     """
-    told, lasted = sum(part.told for part in parts), sum(part.lasted for part in parts)
-    if told <= 100 or lasted > 0.5 * told:
+    told = sum(part.told for part in parts)
+    if told <= 100 or _lasting(parts):
         return 1.0
     return min(max(math.sqrt(sum(part.surprise for part in parts) / told), 0.3), 2.0)
+
+
+def _lasting(parts: Sequence[Estimate]) -> bool:
+    """Whether the errors of most lights that were used last from picture to picture."""
+    return sum(part.lasted for part in parts) > 0.5 * sum(part.told for part in parts)
 
 
 def _clock_s(track: TrackFilter | PathPass, path: Path) -> float:
@@ -270,8 +275,14 @@ def _of_guessed_motion(
             guessed=guessed,
             clock_sigma_s=CLOCK_WITHOUT_S,
             fixes=[(first.between(fix.stamp_ns), fix) for fix in fixes],
+            lasting=_lasting([part]),
         )
-        again = settled(path, part.detection, part.shaking, known, sum(part.told_by), doubtful=False)
+        pass_again = partial(settled, path, part.detection, part.shaking, known, sum(part.told_by), doubtful=False)
+        against = contradicted_by(path, known.fixes)
+        # A fix that contradicts what is found without the lights that it refutes may itself be wrong.
+        again = pass_again(refutes=True) if against else None
+        if again is None or contradicted_by(again[1], known.fixes) >= against:
+            again = pass_again()
         found.append(again or (first, path))
     if not found:
         return Smoothed([], first.clock_ns * 1e-9, math.inf, first.problems)

@@ -18,12 +18,12 @@ import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
 from buddyline.solver_service.track.ahead import told_steps
-from buddyline.solver_service.track.association import LIKELY, Association
+from buddyline.solver_service.track.association import LIKELY, SURE, Association
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.guessing import GuessedMotion
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.lamps import LampWatch
-from buddyline.solver_service.track.lights import Sight, in_picture, pixel_of
+from buddyline.solver_service.track.lights import COLUMNS, Sight, in_picture, pixel_of
 from buddyline.solver_service.track.moving import HOLD_S
 from buddyline.solver_service.track.output import CONTRADICTS, fix_chi2
 from buddyline.solver_service.track.records import Records, pass_over
@@ -57,7 +57,7 @@ from buddyline.solver_service.track.strapdown import (
     propagate,
     sampled,
 )
-from buddyline.solver_service.track.trail import Look, Step
+from buddyline.solver_service.track.trail import Look, Residuals, Step
 from buddyline.solver_service.track.walking import Walking
 from numpy.typing import NDArray
 
@@ -85,6 +85,10 @@ LEAST_TOLD: Final = 0.5
 LEFT_CLOCK_S: Final = 0.002
 LEFT_SIGMAS: Final = 2.0
 LOST_CLOCK_S: Final = 0.02
+# A fix may refute a path's lights between two fixes that agree with it, if these are no further apart.
+REFUTED_S: Final = 4.0
+# Where motion is guessed, and pictures are further apart than this, the next one tells little of this one.
+SOON_S: Final = 0.3
 # Noise and units are judged by the samples of two seconds.
 KEPT_S: Final = 3.0
 
@@ -95,7 +99,8 @@ class PassedOver:
 
     epoch_ns: of the path's times. clock_ns: how far B's clock is believed ahead. shares (2, 2): as `take_off` takes
     them. walking: how far biases walk. unrest, guessed: as in TrackMoves; guessed is learned anew from pass to pass.
-    clock_sigma_s: 1 sd of the clocks' offset. fixes: each at its time, where motion is guessed.
+    clock_sigma_s: 1 sd of the clocks' offset. fixes: each at its time, in order, where motion is guessed. lasting:
+    whether most lights' errors last.
     """
 
     records: Records
@@ -107,6 +112,7 @@ class PassedOver:
     guessed: GuessedMotion | None = None
     clock_sigma_s: float = CLOCK_S
     fixes: Sequence[tuple[float, FixSeen]] = ()
+    lasting: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,15 +279,19 @@ class PathPass(TrackSteps):
             main.trigger = [one for one in main.trigger if abs(sight.t_s - one[0]) < ONE_TRIGGER_S]
             found = self._associated(sight, by_path)
             counts = found.chosen if self._keeps else counted(found.chosen, sight, main)
-            looks.append(Look(sight.node, sight.stamp_ns, sight.t_s, counts))
+            residuals = None
             if found.chosen:
                 more.append(counted_more(found.chosen, counts))
                 note_lit(main, sight, counts)
-                rows.append(light_rows(found.chosen, by_path.y, by_path.H))
+                H, y, noise = light_rows(found.chosen, by_path.y, by_path.H)
+                rows.append((H, y, noise))
+                if self.guessed is not None:
+                    residuals = Residuals(y, noise + np.diag(more[-1]), H[:, COLUMNS])
                 used = [(sight.t_s, sight.node, light) for _, light, _ in found.chosen]
                 lights += used
                 main.trigger += used
                 main.told_by[sight.node] += 1
+            looks.append(Look(sight.node, sight.stamp_ns, sight.t_s, counts, residuals))
         if rows:
             H, y, noise = stacked(rows)
             others = len(y) - 2 * len(lights)
@@ -310,7 +320,10 @@ class PathPass(TrackSteps):
             return Association(in_front(kept, by_path.y), np.zeros(2), 0.0)
         inside = [in_picture(camera, pixel_of(camera, X), EDGE_PX) for X in by_path.X]
         detection = found_now(main, observer, sight.t_s)
-        found = by_path.odds.associate(sight.sigma_px, detection, np.array(inside, dtype=float), LIKELY)
+        # What is likely, but not sure, is taken where the next picture comes soon and tells whether it was right.
+        slow = self.guessed is not None and sight.t_s - main.shown_s[observer] > SOON_S
+        within, least = np.array(inside, dtype=float), SURE if slow else LIKELY
+        found = by_path.odds.associate(sight.sigma_px, detection, within, least)
         main.evidence += found.evidence
         learn_found(main, observer, sight.t_s, detection, inside, found.seen)
         if all(inside):
@@ -323,12 +336,20 @@ class PathPass(TrackSteps):
 
 
 def settled(
-    path: Path, detection: Floats, shaking: Shaking, known: PassedOver, told: int, *, doubtful: bool
+    path: Path,
+    detection: Floats,
+    shaking: Shaking,
+    known: PassedOver,
+    told: int,
+    *,
+    doubtful: bool,
+    refutes: bool = False,
 ) -> tuple[PathPass, Path] | None:
     """Pass over a dive about the last pass's path until that does not move; None where it does not settle.
 
     told: the pictures that the first pass used. doubtful: whether the path may be far off throughout. Where motion is
-    guessed, each pass has what its path tells of it.
+    guessed, each pass has what its path tells of it. refutes: whether the first pass is without the path's lights that
+    fixes refute.
     """
     start_ns, end_ns = (known.epoch_ns + round(t_s * 1e9) for t_s in (path.t_s[0], path.t_s[-1]))
     a, b = known.records
@@ -338,23 +359,25 @@ def settled(
         b.between(start_ns - S_NS + shift_ns, end_ns + S_NS + shift_ns),
     )
     guesses, used = known.guessed is not None, _used(path)
-    contradicted = _contradicted(path, known.fixes) + MORE_CONTRADICTED * len(known.fixes)
+    contradicted = contradicted_by(path, known.fixes) + MORE_CONTRADICTED * len(known.fixes)
     for count in range(1, PASSES + 1):
         if known.guessed is not None:
             known = replace(known, guessed=known.guessed.relearned(path))
         # Only the last pass's rows need this.
         path = replace(path, across=None)
+        if refutes and count == 1:
+            path = _without_refuted(path, known.fixes)
         track = PathPass(known, path, detection, shaking, keeps=guesses and count == 1)
         pass_over(track, records, ())
         passed = track.passed
         about, detection = path, passed.detection
-        path = smoothed(passed.steps, about, auxiliary=guesses, across=not guesses, uses_up=True)
+        path = smoothed(passed.steps, about, auxiliary=guesses, across=not (guesses and known.lasting), uses_up=True)
         if not bool(np.isfinite(path.states).all()):
             return None
         learned = not guesses or count >= GUESSING_PASSES
         stays = learned and _stays(about, path, DOUBTFUL_SIGMAS if doubtful else STAYS_SIGMAS)
         del about  # The next pass needs the memory.
-        if stays and _contradicted(path, known.fixes) <= contradicted:
+        if stays and contradicted_by(path, known.fixes) <= contradicted:
             left_s = path.state(-1).clock_s
             # What a doubtful track, or one without a gyro, tells of the clocks is little, and less than it believes.
             tells = not doubtful and not guesses
@@ -368,9 +391,9 @@ def settled(
     return None
 
 
-def _contradicted(path: Path, fixes: Sequence[tuple[float, FixSeen]]) -> int:
-    """Count the fixes, each at its time, that contradict a path: by its nearest step, carried on to that time."""
-    count = 0
+def _agreements(path: Path, fixes: Sequence[tuple[float, FixSeen]]) -> list[tuple[float, bool]]:
+    """Tell which fixes, each at its time, agree with a path: with its nearest step, carried on to that time."""
+    found = []
     for t_s, fix in fixes:
         after = min(max(int(path.t_s.searchsorted(t_s)), 1), len(path) - 1)
         k = after - int(t_s - path.t_s[after - 1] < path.t_s[after] - t_s)
@@ -378,8 +401,35 @@ def _contradicted(path: Path, fixes: Sequence[tuple[float, FixSeen]]) -> int:
         if abs(on_s) < ONE_TRIGGER_S:
             step, rates_radps = path.state(k), path.rates_radps[k]
             state = step.moved(step.r_m + on_s * step.v_mps, step.v_mps, step.R @ rotation_exp(on_s * rates_radps))
-            count += fix_chi2(state, path.covariance(k), rates_radps, fix) > CONTRADICTS
-    return count
+            chi2 = fix_chi2(state, path.covariance(k), rates_radps, fix)
+            # That of a damaged fix is not a number.
+            if not math.isnan(chi2):
+                found.append((t_s, chi2 <= CONTRADICTS))
+    return found
+
+
+def contradicted_by(path: Path, fixes: Sequence[tuple[float, FixSeen]]) -> int:
+    """Count the fixes that contradict a path."""
+    return sum(not agrees for _, agrees in _agreements(path, fixes))
+
+
+def _without_refuted(path: Path, fixes: Sequence[tuple[float, FixSeen]]) -> Path:
+    """Give a path without the lights that it used between two fixes that agree with it, where one between does not.
+
+    Not where those two are further apart than REFUTED_S: the rest of the dive tells too little of what lies between.
+    """
+    found = _agreements(path, fixes)
+    agree_s = np.array([-math.inf, *(t_s for t_s, agrees in found if agrees), math.inf])
+    against = np.searchsorted(agree_s, [t_s for t_s, agrees in found if not agrees])
+    after = np.searchsorted(agree_s, path.t_s)
+    before_s, after_s = agree_s[after - 1], agree_s[after]
+    away_s = np.minimum(path.t_s - before_s, after_s - path.t_s)
+    refuted = np.isin(after, against) & (after_s - before_s < REFUTED_S) & (away_s > ONE_TRIGGER_S)
+    looks = [
+        tuple(replace(look, chosen=()) for look in seen) if drops else seen
+        for seen, drops in zip(path.looks, refuted.tolist(), strict=True)
+    ]
+    return replace(path, looks=looks)
 
 
 def _used(path: Path) -> NDArray[np.int64]:

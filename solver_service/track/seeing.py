@@ -57,6 +57,10 @@ HIDDEN_S: Final = 1.0
 MOST_FOUND: Final = 0.97
 LEAST_FOUND: Final = 0.02
 FOUND_IN_VIEW: Final = math.sqrt(MOST_FOUND)
+# What a smoothed path's covariance leaves of a light's variance is this share of it at least: where it is known to some
+# hundredths, and where to rounding.
+LEAST_LEFT: Final = 0.02
+ROUNDING: Final = 1e-8
 _STILL: Final = np.eye(MOVING)
 
 
@@ -177,7 +181,9 @@ class TrackSights(TrackMoves):
     def _by_path(self, path: Path, seen: Sequence[tuple[PassGuide, Sight]]) -> list[BySight]:
         """Give what a path says of one node's pictures, and each picture's odds by the path without what it has told.
 
-        That is taken out of the smoothed estimate: P' = P + K H P, K = P H^T (R - H P H^T)^-1.
+        That is taken out of the smoothed estimate: P' = P + K H P, K = P H^T (R - H P H^T)^-1. The difference is small
+        where a picture tells far more than all others do. It is exact where the pass has kept its residuals; else it is
+        formed with another Jacobian than the picture was used with, and is off by some hundredths of R.
         """
         observer, count = seen[0][1].node, max(len(sight.bearings) for _, sight in seen)
         at = np.array([guide.step for guide, _ in seen])
@@ -195,17 +201,22 @@ class TrackSights(TrackMoves):
         # The rows of lights that a picture did not use stay 0, and tell nothing.
         H_used, y_used = np.zeros((len(seen), 4, len(COLUMNS) + 1)), np.zeros((len(seen), 4))
         R = np.ones((len(seen), 4))
+        kept = [(n, guide.look.residuals) for n, (guide, _) in enumerate(seen) if guide.look.residuals is not None]
         for n, (guide, _) in enumerate(seen):
             for row, (k, light, variance) in enumerate(in_front(guide.look.chosen, y[n])):
                 rows = slice(2 * row, 2 * row + 2)
                 H_used[n, rows], y_used[n, rows], R[n, rows] = H[n, k, light], y[n, k, light], variance
+        for n, left in kept:
+            H_used[n, : len(left.y), :-1], y_used[n, : len(left.y)] = left.H, left.y
         H_used, late = H_used[..., :-1], STAMP_SIGMA_S * H_used[..., -1:]
         across = P @ np.swapaxes(H_used, 1, 2)
         rest = R[:, :, None] * np.eye(4) + late * np.swapaxes(late, 1, 2) - H_used @ across
-        # Rounding, and pictures that share a step, can leave less than nothing.
+        # No light leaves less than this share of its variance.
+        least = np.full((len(seen), 1), LEAST_LEFT)
+        for n, left in kept:
+            rest[n, : len(left.y), : len(left.y)], least[n] = left.S, ROUNDING
         values, vectors = np.linalg.eigh(rest)
-        least = 0.02 * np.where(H_used.any(axis=2), R, np.inf).min(axis=1, keepdims=True)
-        values = np.maximum(values, least)
+        values = np.maximum(values, least * np.where(H_used.any(axis=2), R, np.inf).min(axis=1, keepdims=True))
         inverse = (vectors / values[:, None]) @ np.swapaxes(vectors, 1, 2)
         gain = across @ inverse
         P = P + gain @ np.swapaxes(across, 1, 2)
@@ -241,7 +252,7 @@ class TrackSights(TrackMoves):
         more = counted_more(found.chosen, used)
         error, chi2 = told_by(estimate, rows_H, rows_y, noise, more, teaches=True)
         estimate.state = estimate.state.plus(error)
-        estimate.lasted += int(np.count_nonzero(more))
+        estimate.lasted += 2 * sum(float(sight.lasting_s[k]) > 0.0 for k, *_ in found.chosen)
         note_lit(estimate, sight, used)
         estimate.surprise += chi2
         estimate.told += len(rows_y)

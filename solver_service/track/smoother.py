@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
-from buddyline.solver_service.track.lights import COLUMNS
+from buddyline.solver_service.track.lights import BLOCK, COLUMNS
 from buddyline.solver_service.track.state import (
     CLOCK_COLUMN,
     GYRO_BIAS,
@@ -119,9 +119,10 @@ def smoothed(
 
     Backward, C = P F^T (P-)^-1 with P- = F P F^T + Q; the state is off its filtered one by C (x+1 - x-), its covariance
     P + C (P+1 - P-) C^T. about: the path that these steps are linear about: errors are then taken against it, where
-    they add up exactly. auxiliary: whether to give auxiliary residuals (Harvey and Koopman 1992),
-    s = (P-)^-1 (x+1 - x-): the noise was off by Q s. The covariance of s is (P-)^-1 (P- - P+1) (P-)^-1. across: whether
-    to give the covariances of neighbours, C P+1 (de Jong and MacKinnon 1988). uses_up: whether the steps are let go of.
+    they add up exactly, and each look has the residuals that the smoothed errors leave. auxiliary: whether to give
+    auxiliary residuals (Harvey and Koopman 1992), s = (P-)^-1 (x+1 - x-): the noise was off by Q s. The covariance of s
+    is (P-)^-1 (P- - P+1) (P-)^-1. across: whether to give the covariances of neighbours, C P+1 (de Jong and MacKinnon
+    1988). uses_up: whether the steps are let go of.
     """
     count = len(steps)
     looks: list[tuple[Look, ...]] = [()] * count
@@ -166,7 +167,10 @@ def smoothed(
         found[k], path.halves[k] = here, P[_BLOCK_UPPER]
         drawn[k] = step.Q[_DRAWN]
         path.rates_radps[k] = step.rates_radps
-        looks[k] = step.looks
+        looks[k] = tuple(
+            replace(look, residuals=look.residuals.left_by(here[COLUMNS], P[BLOCK])) if look.residuals else look
+            for look in step.looks
+        )
         later = step
     if count:
         path.oldest[:] = P

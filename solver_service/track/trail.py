@@ -17,13 +17,35 @@ Chosen: TypeAlias = tuple[tuple[int, int, float], ...]
 
 
 @dataclass(frozen=True, eq=False)
+class Residuals:
+    """How far the lights of one picture are off the path that a pass is linear about.
+
+    y (2 n,), S (2 n, 2 n) and H (2 n, C): residuals, their noise R, and their Jacobian by COLUMNS. Once the pass is
+    smoothed, y is what the smoothed errors leave of them, and S the covariance of that, R - H P H^T.
+    """
+
+    y: Floats
+    S: Floats
+    H: Floats
+
+    def left_by(self, error: Floats, P: Floats) -> Residuals:
+        """Give what smoothed errors (C,) of covariance P (C, C) leave of them."""
+        return Residuals(self.y - self.H @ error, self.S - self.H @ P @ self.H.T, self.H)
+
+
+@dataclass(frozen=True, eq=False)
 class Look:
-    """One picture within a step, and the lights that were used."""
+    """One picture within a step, and the lights that were used.
+
+    residuals: of these, in a pass about a path, where motion is guessed. Samples tell so much of the motion between two
+    pictures that each picture can be taken out of a path without them.
+    """
 
     node: int
     stamp_ns: int
     t_s: float
     chosen: Chosen
+    residuals: Residuals | None = None
 
 
 @dataclass(frozen=True, eq=False)

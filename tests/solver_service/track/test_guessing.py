@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track import dive as dive_module
 from buddyline.solver_service.track import relax
-from buddyline.solver_service.track.association import Association, Odds
+from buddyline.solver_service.track.association import LIKELY, SURE, Association, Odds
 from buddyline.solver_service.track.dive import smooth
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
@@ -19,7 +20,7 @@ from buddyline.solver_service.track.moving import TrackMoves
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.parts import parts_of
 from buddyline.solver_service.track.records import pass_over
-from buddyline.solver_service.track.relax import PassedOver, PathPass, _contradicted, settled
+from buddyline.solver_service.track.relax import PassedOver, PathPass, _without_refuted, contradicted_by, settled
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.smoother import Path, smoothed
 from buddyline.solver_service.track.state import MOVING, SIZE, V_, State
@@ -257,7 +258,7 @@ def test_a_whole_dives_passes_know_its_fixes(bare: KnownDive, monkeypatch: pytes
 
     def noted(path: Path, detection: Floats, shaking: Shaking, known: PassedOver, *told: int, doubtful: bool) -> None:
         far = [(t_s, replace(fix, t_a_b_m=1.5 * fix.t_a_b_m)) for t_s, fix in known.fixes]
-        counts.append((_contradicted(path, known.fixes), _contradicted(path, far)))
+        counts.append((contradicted_by(path, known.fixes), contradicted_by(path, far)))
 
     monkeypatch.setattr(dive_module, "settled", noted)
     smooth(bare.records, bare.fixes, bare.stamps_ns)
@@ -288,11 +289,11 @@ def test_passes_go_on_while_they_contradict_more_fixes_than_the_first_path(
     bare: KnownDive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, part, known = first_pass(bare)
-    assert _contradicted(path, known.fixes) == 0
+    assert contradicted_by(path, known.fixes) == 0
     far = [(t_s, replace(fix, t_a_b_m=1.5 * fix.t_a_b_m)) for t_s, fix in known.fixes]
     # One of them is damaged: it tells nothing.
-    assert _contradicted(path, far) == len(far) - 1 > 5
-    assert _contradicted(path, [(t_s + 1e3, fix) for t_s, fix in far]) == 0
+    assert contradicted_by(path, far) == len(far) - 1 > 5
+    assert contradicted_by(path, [(t_s + 1e3, fix) for t_s, fix in far]) == 0
     counts: list[int] = []
 
     def contradicted(*_: object) -> int:
@@ -301,7 +302,92 @@ def test_passes_go_on_while_they_contradict_more_fixes_than_the_first_path(
 
     monkeypatch.setattr(relax, "GUESSING_PASSES", 1)
     monkeypatch.setattr(relax, "_stays", lambda *_: True)
-    monkeypatch.setattr(relax, "_contradicted", contradicted)
+    monkeypatch.setattr(relax, "contradicted_by", contradicted)
     assert settled(path, part.detection, part.shaking, known, 0, doubtful=False) is not None
     # The first path's own; three passes that contradict one fix more; the one that is taken.
     assert counts == [0, 1, 1, 1, 0]
+
+
+def test_lights_between_two_near_fixes_that_agree_are_not_kept_where_one_between_contradicts(bare: KnownDive) -> None:
+    path, _, known = first_pass(bare)
+    damaged, *fixes = known.fixes
+    assert _without_refuted(path, [damaged, *fixes]).looks == list(path.looks)
+    n = len(fixes) // 2
+    (before_s, _), (at_s, fix), (after_s, _) = fixes[n - 1 : n + 2]
+    fixes[n] = at_s, replace(fix, t_a_b_m=1.5 * fix.t_a_b_m)
+    looks = _without_refuted(path, fixes).looks
+    for t_s, was, now in zip(path.t_s.tolist(), path.looks, looks, strict=True):
+        # Both pictures of a fix are some milliseconds from its time.
+        if before_s + 0.02 < t_s < after_s - 0.02:
+            assert not any(look.chosen for look in now)
+        else:
+            assert now == was
+    # None agrees after it; the next ones that agree are far off.
+    for told in (fixes[: n + 1], [fixes[0], fixes[n], fixes[-1]]):
+        assert _without_refuted(path, told).looks == list(path.looks)
+
+
+def test_lights_that_a_fix_refutes_are_kept_if_the_fix_is_wrong(
+    bare: KnownDive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It contradicts what all other lights tell, too."""
+    tried: list[bool] = []
+
+    def noted(*args: Any, refutes: bool = False, **options: Any) -> tuple[PathPass, Path] | None:
+        tried.append(refutes)
+        return settled(*args, refutes=refutes, **options)
+
+    monkeypatch.setattr(dive_module, "settled", noted)
+    _, *fixes = bare.fixes
+    n = len(fixes) // 2
+    wrong = [*fixes[:n], replace(fixes[n], t_a_b_m=1.5 * fixes[n].t_a_b_m), *fixes[n + 1 :]]
+    found = [list(smooth(bare.records, each, bare.stamps_ns).rows) for each in (fixes, wrong)]
+    assert tried == [False, True, False]
+    places = [np.array([row.t_a_b_m for row in rows]) for rows in found]
+    assert places[1] == pytest.approx(places[0], abs=1e-3)
+
+
+@pytest.mark.parametrize("lasting", [False, True])
+def test_rows_are_as_sure_as_both_steps_unless_errors_of_lights_last(bare: KnownDive, *, lasting: bool) -> None:
+    path, part, known = first_pass(bare)
+    found = settled(path, part.detection, part.shaking, replace(known, lasting=lasting), 0, doubtful=False)
+    assert found is not None
+    assert (found[1].across is None) == lasting
+
+
+@pytest.mark.parametrize("lasting_s", [0.0, 1.3])
+def test_a_whole_dives_passes_know_whether_errors_of_its_lights_last(
+    bare: KnownDive, monkeypatch: pytest.MonkeyPatch, lasting_s: float
+) -> None:
+    told: list[bool] = []
+
+    def noted(path: Path, detection: Floats, shaking: Shaking, known: PassedOver, *_: int, doubtful: bool) -> None:
+        told.append(known.lasting)
+
+    monkeypatch.setattr(dive_module, "settled", noted)
+    a, b = (
+        replace(record, frames=[replace(f, lasting_s=np.full(len(f.pixels), lasting_s)) for f in record.frames])
+        for record in bare.records
+    )
+    smooth((a, b), bare.fixes, bare.stamps_ns)
+    assert told == [lasting_s > 0.0]
+
+
+@pytest.mark.parametrize(("rate_hz", "least"), [(10.0, LIKELY), (3.0, SURE)])
+def test_doubtful_lights_are_taken_where_the_next_picture_comes_soon(
+    monkeypatch: pytest.MonkeyPatch, rate_hz: float, least: float
+) -> None:
+    dive = make(9, Setting(seconds=12.0, rate_hz=rate_hz, near_m=4.0, far_m=8.0, false=0))
+    path, part, known = first_pass(replace(dive, records=bare_of(dive)))
+    asked: list[float] = []
+
+    def noted(odds: Odds, sigma_px: Floats, detection: Floats, within: Floats, least: float) -> Association:
+        asked.append(least)
+        return associate(odds, sigma_px, detection, within, least)
+
+    associate = Odds.associate
+    monkeypatch.setattr(Odds, "associate", noted)
+    pass_over(PathPass(known, path, part.detection, part.shaking), known.records, ())
+    # Before each node's first picture there was none.
+    assert len(asked) > 20
+    assert sum(one != least for one in asked) <= 2

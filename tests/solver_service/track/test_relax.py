@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track import relax, seeing
+from buddyline.solver_service.track.association import odds_of
 from buddyline.solver_service.track.dive import smooth
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.lights import COLUMNS, Sight, with_stamp
@@ -19,7 +20,8 @@ from buddyline.solver_service.track.state import MOVING, NAV, PHI, R_, SIZE
 from buddyline.solver_service.track.walking import Walking
 
 from tests.solver_service.track.assignments import weigh
-from tests.solver_service.track.dives import EPOCH_NS, KnownDive, Setting, filter_of, make, score
+from tests.solver_service.track.dives import EPOCH_NS, KnownDive, Setting, bare_of, filter_of, make, score
+from tests.solver_service.track.test_guessing import first_pass
 
 
 def passed_about(dive: KnownDive, path: Path) -> Path:
@@ -123,6 +125,46 @@ def test_pictures_are_weighed_together_by_all_the_dive_but_themselves() -> None:
             assert weighed == pytest.approx([by_case[str(case)] for case in found], abs=1e-4)
             counts.add((len(sight.bearings), len(guide.look.chosen)))
     assert len(counts) > 5
+
+
+def test_what_a_slow_dive_says_of_a_picture_without_it_is_exact() -> None:
+    """Half a second without a unit: the picture tells a hundred times more than all others, and must be taken out."""
+    dive = make(9, Setting(seconds=12.0, rate_hz=3.0, near_m=4.0, far_m=8.0, false=0))
+    dive = replace(dive, records=bare_of(dive))
+    path, part, known = first_pass(dive)
+
+    def passed(about: Path) -> tuple[PathPass, Path]:
+        track = PathPass(known, about, part.detection, part.shaking, keeps=True)
+        pass_over(track, known.records, ())
+        return track, smoothed(track.passed.steps, about)
+
+    track, whole = passed(path)
+    track.guide_by(whole)
+    for node, record in enumerate(dive.records):
+        feed(track, node, record)
+    sights = {(sight.node, sight.stamp_ns): sight for _, _, _, sight in track._events if isinstance(sight, Sight)}
+    spreads: list[float] = []
+    for key, guide in list(track.guides.items())[4::9]:
+        if len(guide.look.chosen) < 2:
+            continue
+        [by_path] = track._by_path(whole, [(guide, sights[key])])
+        without = [
+            tuple(replace(look, chosen=()) if (look.node, look.stamp_ns) == key else look for look in looks)
+            for looks in path.looks
+        ]
+        _, other = passed(replace(path, looks=without))
+        step, after_s = guide.step, guide.look.t_s - float(whole.t_s[guide.step])
+        *_, y, H = track._compared(sights[key], other.state(step), other.rates_radps[step], after_s)
+        clutter = np.array([sights[key].clutter])
+        [exact] = odds_of(
+            y[None], H[None], with_stamp(other.covariance(step))[None], sights[key].sigma_px[None], clutter
+        )
+        # The lights stand elsewhere by the other path, where the same errors move them a little otherwise.
+        assert by_path.odds.spread_px2 == pytest.approx(exact.spread_px2, rel=0.05)
+        assert np.abs(by_path.odds.y_px - exact.y_px).max() < 0.05 * np.sqrt(exact.spread_px2).max()
+        spreads.append(float(np.sqrt(exact.spread_px2).max()))
+    assert len(spreads) > 3
+    assert max(spreads) > 10.0
 
 
 @pytest.mark.slow
