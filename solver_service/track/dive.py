@@ -282,6 +282,7 @@ def _of_guessed_motion(
         # A fix that contradicts what is found without the lights that it refutes may itself be wrong.
         again = pass_again(refutes=True) if against else None
         if again is None or contradicted_by(again[1], known.fixes) >= against:
+            again = None  # The passes need its memory.
             again = pass_again()
         found.append(again or (first, path))
     if not found:
