@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial, reduce
+from functools import reduce
 from itertools import chain
 from typing import Final
 
@@ -42,7 +42,8 @@ from buddyline.solver_service.track.records import (
     stamp_of,
     until_one_ended,
 )
-from buddyline.solver_service.track.relax import PassedOver, PathPass, clock_sigma_s, contradicted_by, settled
+from buddyline.solver_service.track.relax import PassedOver, PathPass
+from buddyline.solver_service.track.settling import clock_sigma_s, settled
 from buddyline.solver_service.track.smoother import Path, smoothed
 from buddyline.solver_service.track.start import CLOCK_S
 from buddyline.solver_service.track.vibration import Shares
@@ -277,13 +278,7 @@ def _of_guessed_motion(
             fixes=[(first.between(fix.stamp_ns), fix) for fix in fixes],
             lasting=_lasting([part]),
         )
-        pass_again = partial(settled, path, part.detection, part.shaking, known, sum(part.told_by), doubtful=False)
-        against = contradicted_by(path, known.fixes)
-        # A fix that contradicts what is found without the lights that it refutes may itself be wrong.
-        again = pass_again(refutes=True) if against else None
-        if again is None or contradicted_by(again[1], known.fixes) >= against:
-            again = None  # The passes need its memory.
-            again = pass_again()
+        again = settled(path, part.detection, part.shaking, known, sum(part.told_by), doubtful=False)
         found.append(again or (first, path))
     if not found:
         return Smoothed([], first.clock_ns * 1e-9, math.inf, first.problems)

@@ -2,8 +2,8 @@
 
 A filter is linear at its own estimates, of which the first of a dive are the worst. Here every step and every light is
 linear about the path of the pass before, and all that moves is the error against that path: a linear problem, solved
-exactly. Repeated, it comes to the likeliest path of the dive. How a known path goes on and where it has the lights does
-not depend on what is filtered, so that is worked out for many steps at once.
+exactly. Repeated (`settling.py`), it comes to the likeliest path of the dive. How a known path goes on and where it has
+the lights does not depend on what is filtered, so that is worked out for many steps at once.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from buddyline.protocol.clock import S_NS
-from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
+from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.ahead import told_steps
 from buddyline.solver_service.track.association import LIKELY, SURE, Association
 from buddyline.solver_service.track.estimate import Estimate
@@ -25,9 +24,7 @@ from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.lamps import LampWatch
 from buddyline.solver_service.track.lights import COLUMNS, Sight, in_picture, pixel_of
 from buddyline.solver_service.track.moving import HOLD_S
-from buddyline.solver_service.track.output import CONTRADICTS, fix_chi2
-from buddyline.solver_service.track.records import Records, pass_over
-from buddyline.solver_service.track.search import FURTHEST_M
+from buddyline.solver_service.track.records import Records
 from buddyline.solver_service.track.seeing import (
     EDGE_PX,
     ONE_TRIGGER_S,
@@ -44,9 +41,9 @@ from buddyline.solver_service.track.seeing import (
     told_by,
 )
 from buddyline.solver_service.track.shaking import Shaking
-from buddyline.solver_service.track.smoother import Path, smoothed
+from buddyline.solver_service.track.smoother import Path
 from buddyline.solver_service.track.start import CLOCK_S, broad_start, constants_of
-from buddyline.solver_service.track.state import MOVING, NAV, R_, State
+from buddyline.solver_service.track.state import MOVING, State
 from buddyline.solver_service.track.stepping import DEPTH_GATE, TrackSteps
 from buddyline.solver_service.track.strapdown import (
     integrate,
@@ -59,34 +56,9 @@ from buddyline.solver_service.track.strapdown import (
 )
 from buddyline.solver_service.track.trail import Look, Residuals, Step
 from buddyline.solver_service.track.walking import Walking
-from numpy.typing import NDArray
 
 # What is believed of the place at first, 1 sd, as a share of the range.
 BROAD_SHARE: Final = 0.5
-# A dive is passed over so often at most, until a pass moves no pose by so many sigmas: the next one would move none by
-# much more than a tenth of that. Tracks that began with single lamps, or late, settle more slowly.
-PASSES: Final = 24
-STAYS_SIGMAS: Final = 1.0
-DOUBTFUL_SIGMAS: Final = 0.3
-LOOKED_AT: Final = 10
-# Where motion is guessed, a dive is passed over so often at least, for each pass learns more of it. The first pass
-# keeps the lights: by the motion that a filter guesses, half of a node's pictures may seem to have none. The last pass
-# must use this share of the pictures that the first path used, of each node: one that uses fewer has gone astray.
-GUESSING_PASSES: Final = 4
-GUESSING_TOLD: Final = 0.95
-# One that contradicts more fixes than the first path, by more than this share of all, has gone astray, too.
-MORE_CONTRADICTED: Final = 0.01
-# A doubtful track may settle at a wrong path. There is a track where chi^2 of each residual is below UNFIT, on average,
-# and the last pass uses LEAST_TOLD of the first one's pictures.
-UNFIT: Final = 1.5
-LEAST_TOLD: Final = 0.5
-# Where a dive's passes have settled with the clocks so far and so many sigmas off what they assumed, the dive is passed
-# over again with what they found: of an offset they find a part. Further off, the path is no place to be linear about.
-LEFT_CLOCK_S: Final = 0.002
-LEFT_SIGMAS: Final = 2.0
-LOST_CLOCK_S: Final = 0.02
-# A fix may refute a path's lights between two fixes that agree with it, if these are no further apart.
-REFUTED_S: Final = 4.0
 # Where motion is guessed, and pictures are further apart than this, the next one tells little of this one.
 SOON_S: Final = 0.3
 # Noise and units are judged by the samples of two seconds.
@@ -333,119 +305,3 @@ class PathPass(TrackSteps):
     def _apply(self, estimate: Estimate, H: Floats, y: Floats, noise: Floats) -> None:
         error, _ = told_by(estimate, H, y - H @ self._off, noise)
         self._off = self._off + error
-
-
-def settled(
-    path: Path,
-    detection: Floats,
-    shaking: Shaking,
-    known: PassedOver,
-    told: int,
-    *,
-    doubtful: bool,
-    refutes: bool = False,
-) -> tuple[PathPass, Path] | None:
-    """Pass over a dive about the last pass's path until that does not move; None where it does not settle.
-
-    told: the pictures that the first pass used. doubtful: whether the path may be far off throughout. Where motion is
-    guessed, each pass has what its path tells of it. refutes: whether the first pass is without the path's lights that
-    fixes refute.
-    """
-    start_ns, end_ns = (known.epoch_ns + round(t_s * 1e9) for t_s in (path.t_s[0], path.t_s[-1]))
-    a, b = known.records
-    shift_ns = known.clock_ns
-    records = (
-        a.between(start_ns - S_NS, end_ns + S_NS),
-        b.between(start_ns - S_NS + shift_ns, end_ns + S_NS + shift_ns),
-    )
-    guesses, used = known.guessed is not None, _used(path)
-    contradicted = contradicted_by(path, known.fixes) + MORE_CONTRADICTED * len(known.fixes)
-    for count in range(1, PASSES + 1):
-        if known.guessed is not None:
-            known = replace(known, guessed=known.guessed.relearned(path))
-        # Only the last pass's rows need this.
-        path = replace(path, across=None)
-        if refutes and count == 1:
-            path = _without_refuted(path, known.fixes)
-        track = PathPass(known, path, detection, shaking, keeps=guesses and count == 1)
-        pass_over(track, records, ())
-        passed = track.passed
-        about, detection = path, passed.detection
-        path = smoothed(passed.steps, about, auxiliary=guesses, across=not (guesses and known.lasting), uses_up=True)
-        if not bool(np.isfinite(path.states).all()):
-            return None
-        learned = not guesses or count >= GUESSING_PASSES
-        stays = learned and _stays(about, path, DOUBTFUL_SIGMAS if doubtful else STAYS_SIGMAS)
-        del about  # The next pass needs the memory.
-        if stays and contradicted_by(path, known.fixes) <= contradicted:
-            left_s = path.state(-1).clock_s
-            # What a doubtful track, or one without a gyro, tells of the clocks is little, and less than it believes.
-            tells = not doubtful and not guesses
-            if tells and max(LEFT_CLOCK_S, LEFT_SIGMAS * clock_sigma_s(path)) < abs(left_s) < LOST_CLOCK_S:
-                known, path = replace(known, clock_ns=known.clock_ns + round(left_s * 1e9)), path.later(left_s)
-                continue
-            fits = passed.surprise < UNFIT * passed.told and sum(passed.told_by) > LEAST_TOLD * told
-            fits = fits and not (guesses and (_used(path) < GUESSING_TOLD * used).any())
-            near = np.linalg.norm(path.states[:, R_], axis=1).max() < FURTHEST_M
-            return (track, path) if near and (fits or not (doubtful or guesses)) else None
-    return None
-
-
-def _agreements(path: Path, fixes: Sequence[tuple[float, FixSeen]]) -> list[tuple[float, bool]]:
-    """Tell which fixes, each at its time, agree with a path: with its nearest step, carried on to that time."""
-    found = []
-    for t_s, fix in fixes:
-        after = min(max(int(path.t_s.searchsorted(t_s)), 1), len(path) - 1)
-        k = after - int(t_s - path.t_s[after - 1] < path.t_s[after] - t_s)
-        on_s = t_s - path.t_s[k]
-        if abs(on_s) < ONE_TRIGGER_S:
-            step, rates_radps = path.state(k), path.rates_radps[k]
-            state = step.moved(step.r_m + on_s * step.v_mps, step.v_mps, step.R @ rotation_exp(on_s * rates_radps))
-            chi2 = fix_chi2(state, path.covariance(k), rates_radps, fix)
-            # That of a damaged fix is not a number.
-            if not math.isnan(chi2):
-                found.append((t_s, chi2 <= CONTRADICTS))
-    return found
-
-
-def contradicted_by(path: Path, fixes: Sequence[tuple[float, FixSeen]]) -> int:
-    """Count the fixes that contradict a path."""
-    return sum(not agrees for _, agrees in _agreements(path, fixes))
-
-
-def _without_refuted(path: Path, fixes: Sequence[tuple[float, FixSeen]]) -> Path:
-    """Give a path without the lights that it used between two fixes that agree with it, where one between does not.
-
-    Not where those two are further apart than REFUTED_S: the rest of the dive tells too little of what lies between.
-    """
-    found = _agreements(path, fixes)
-    agree_s = np.array([-math.inf, *(t_s for t_s, agrees in found if agrees), math.inf])
-    against = np.searchsorted(agree_s, [t_s for t_s, agrees in found if not agrees])
-    after = np.searchsorted(agree_s, path.t_s)
-    before_s, after_s = agree_s[after - 1], agree_s[after]
-    away_s = np.minimum(path.t_s - before_s, after_s - path.t_s)
-    refuted = np.isin(after, against) & (after_s - before_s < REFUTED_S) & (away_s > ONE_TRIGGER_S)
-    looks = [
-        tuple(replace(look, chosen=()) for look in seen) if drops else seen
-        for seen, drops in zip(path.looks, refuted.tolist(), strict=True)
-    ]
-    return replace(path, looks=looks)
-
-
-def _used(path: Path) -> NDArray[np.int64]:
-    """Count the pictures of A and of B (2,) in which a path uses a light."""
-    used = [look.node for looks in path.looks for look in looks if look.chosen]
-    return np.bincount(np.array(used, dtype=np.int64), minlength=2)
-
-
-def clock_sigma_s(path: Path) -> float:
-    """Give 1 sd of the clocks' offset at a path's end."""
-    return math.sqrt(path.covariance(-1)[NAV, NAV])
-
-
-def _stays(old: Path, new: Path, sigmas: float) -> bool:
-    """Whether a pass over a dive has left each pose within so many sigmas of where the pass before had it."""
-    at = np.arange(0, len(new), LOOKED_AT)
-    moved = State(new.states[at]).minus(State(old.states[at]))[:, :NAV, None]
-    chi2 = np.swapaxes(moved, 1, 2) @ np.linalg.solve(new.covariance(at)[:, :NAV, :NAV], moved)
-    return bool((chi2 < NAV * sigmas**2).all())

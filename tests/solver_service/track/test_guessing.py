@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,17 +11,19 @@ import numpy as np
 import pytest
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track import dive as dive_module
-from buddyline.solver_service.track import relax
+from buddyline.solver_service.track import settling
 from buddyline.solver_service.track.association import LIKELY, SURE, Association, Odds
 from buddyline.solver_service.track.dive import smooth
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.guessing import LEAST, MOST, NEAR, GuessedMotion
+from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.moving import TrackMoves
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.parts import parts_of
 from buddyline.solver_service.track.records import pass_over
-from buddyline.solver_service.track.relax import PassedOver, PathPass, _without_refuted, contradicted_by, settled
+from buddyline.solver_service.track.relax import PassedOver, PathPass
+from buddyline.solver_service.track.settling import _agreements, _without_refuted, settled
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.smoother import Path, smoothed
 from buddyline.solver_service.track.state import MOVING, SIZE, V_, State
@@ -218,7 +221,7 @@ def test_passes_that_use_fewer_pictures_than_the_first_are_not_taken(
         """No pass settles."""
 
     again = rows()
-    monkeypatch.setattr(relax, "GUESSING_TOLD", 1.5)
+    monkeypatch.setattr(settling, "GUESSING_TOLD", 1.5)
     refused = rows()
     monkeypatch.setattr(dive_module, "settled", settle_nowhere)
     first = rows()
@@ -245,6 +248,10 @@ def first_pass(dive: KnownDive) -> tuple[Path, Estimate, PassedOver]:
     return smoothed(part.steps, auxiliary=True), part, known
 
 
+def contradictions(path: Path, fixes: Sequence[tuple[float, FixSeen]]) -> int:
+    return sum(not agrees for _, agrees in _agreements(path, fixes))
+
+
 def test_a_pass_that_keeps_the_lights_learns_nothing_of_how_likely_they_are_found(bare: KnownDive) -> None:
     path, part, known = first_pass(bare)
     track = PathPass(known, path, part.detection, part.shaking, keeps=True)
@@ -258,7 +265,7 @@ def test_a_whole_dives_passes_know_its_fixes(bare: KnownDive, monkeypatch: pytes
 
     def noted(path: Path, detection: Floats, shaking: Shaking, known: PassedOver, *told: int, doubtful: bool) -> None:
         far = [(t_s, replace(fix, t_a_b_m=1.5 * fix.t_a_b_m)) for t_s, fix in known.fixes]
-        counts.append((contradicted_by(path, known.fixes), contradicted_by(path, far)))
+        counts.append((contradictions(path, known.fixes), contradictions(path, far)))
 
     monkeypatch.setattr(dive_module, "settled", noted)
     smooth(bare.records, bare.fixes, bare.stamps_ns)
@@ -279,8 +286,8 @@ def test_the_first_pass_keeps_the_lights_and_those_after_it_decide_again(
         return len(used) == 3
 
     monkeypatch.setattr(Odds, "associate", lambda *_: Association((), np.zeros(2), 0.0))
-    monkeypatch.setattr(relax, "GUESSING_PASSES", 1)
-    monkeypatch.setattr(relax, "_stays", settles_third)
+    monkeypatch.setattr(settling, "GUESSING_PASSES", 1)
+    monkeypatch.setattr(settling, "_stays", settles_third)
     settled(path, part.detection, part.shaking, known, 0, doubtful=False)
     assert used == [sum(bool(look.chosen) for looks in path.looks for look in looks), 0, 0]
 
@@ -289,20 +296,20 @@ def test_passes_go_on_while_they_contradict_more_fixes_than_the_first_path(
     bare: KnownDive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, part, known = first_pass(bare)
-    assert contradicted_by(path, known.fixes) == 0
+    assert contradictions(path, known.fixes) == 0
     far = [(t_s, replace(fix, t_a_b_m=1.5 * fix.t_a_b_m)) for t_s, fix in known.fixes]
     # One of them is damaged: it tells nothing.
-    assert contradicted_by(path, far) == len(far) - 1 > 5
-    assert contradicted_by(path, [(t_s + 1e3, fix) for t_s, fix in far]) == 0
+    assert contradictions(path, far) == len(far) - 1 > 5
+    assert contradictions(path, [(t_s + 1e3, fix) for t_s, fix in far]) == 0
     counts: list[int] = []
 
     def contradicted(*_: object) -> int:
         counts.append(int(1 <= len(counts) < 4))
         return counts[-1]
 
-    monkeypatch.setattr(relax, "GUESSING_PASSES", 1)
-    monkeypatch.setattr(relax, "_stays", lambda *_: True)
-    monkeypatch.setattr(relax, "contradicted_by", contradicted)
+    monkeypatch.setattr(settling, "GUESSING_PASSES", 1)
+    monkeypatch.setattr(settling, "_stays", lambda *_: True)
+    monkeypatch.setattr(settling, "_contradictions", contradicted)
     assert settled(path, part.detection, part.shaking, known, 0, doubtful=False) is not None
     # The first path's own; three passes that contradict one fix more; the one that is taken.
     assert counts == [0, 1, 1, 1, 0]
@@ -311,12 +318,13 @@ def test_passes_go_on_while_they_contradict_more_fixes_than_the_first_path(
 def test_lights_between_two_near_fixes_that_agree_are_not_kept_where_one_between_contradicts(bare: KnownDive) -> None:
     path, _, known = first_pass(bare)
     damaged, *fixes = known.fixes
-    assert _without_refuted(path, [damaged, *fixes]).looks == list(path.looks)
+    assert _without_refuted(path, _agreements(path, [damaged, *fixes])) is None
     n = len(fixes) // 2
     (before_s, _), (at_s, fix), (after_s, _) = fixes[n - 1 : n + 2]
     fixes[n] = at_s, replace(fix, t_a_b_m=1.5 * fix.t_a_b_m)
-    looks = _without_refuted(path, fixes).looks
-    for t_s, was, now in zip(path.t_s.tolist(), path.looks, looks, strict=True):
+    lighter = _without_refuted(path, _agreements(path, fixes))
+    assert lighter is not None
+    for t_s, was, now in zip(path.t_s.tolist(), path.looks, lighter.looks, strict=True):
         # Both pictures of a fix are some milliseconds from its time.
         if before_s + 0.02 < t_s < after_s - 0.02:
             assert not any(look.chosen for look in now)
@@ -324,27 +332,31 @@ def test_lights_between_two_near_fixes_that_agree_are_not_kept_where_one_between
             assert now == was
     # None agrees after it; the next ones that agree are far off.
     for told in (fixes[: n + 1], [fixes[0], fixes[n], fixes[-1]]):
-        assert _without_refuted(path, told).looks == list(path.looks)
+        assert _without_refuted(path, _agreements(path, told)) is None
 
 
 def test_lights_that_a_fix_refutes_are_kept_if_the_fix_is_wrong(
     bare: KnownDive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It contradicts what all other lights tell, too."""
-    tried: list[bool] = []
+    """It contradicts what all other lights tell, too, and two passes show that."""
+    pictures: list[int] = []
 
-    def noted(*args: Any, refutes: bool = False, **options: Any) -> tuple[PathPass, Path] | None:
-        tried.append(refutes)
-        return settled(*args, refutes=refutes, **options)
+    class Noted(PathPass):
+        def __init__(self, known: PassedOver, path: Path, *args: Any, **options: Any) -> None:
+            pictures.append(sum(bool(look.chosen) for looks in path.looks for look in looks))
+            super().__init__(known, path, *args, **options)
 
-    monkeypatch.setattr(dive_module, "settled", noted)
+    monkeypatch.setattr(settling, "PathPass", Noted)
     _, *fixes = bare.fixes
     n = len(fixes) // 2
     wrong = [*fixes[:n], replace(fixes[n], t_a_b_m=1.5 * fixes[n].t_a_b_m), *fixes[n + 1 :]]
-    found = [list(smooth(bare.records, each, bare.stamps_ns).rows) for each in (fixes, wrong)]
-    assert tried == [False, True, False]
-    places = [np.array([row.t_a_b_m for row in rows]) for rows in found]
-    assert places[1] == pytest.approx(places[0], abs=1e-3)
+    right_rows = list(smooth(bare.records, fixes, bare.stamps_ns).rows)
+    passes, pictures[:] = list(pictures), []
+    wrong_rows = list(smooth(bare.records, wrong, bare.stamps_ns).rows)
+    assert pictures[2:] == passes
+    assert 0 < passes[0] - pictures[0] < 10
+    places = [np.array([row.t_a_b_m for row in rows]) for rows in (right_rows, wrong_rows)]
+    assert (places[1] == places[0]).all()
 
 
 @pytest.mark.parametrize("lasting", [False, True])
@@ -374,7 +386,7 @@ def test_a_whole_dives_passes_know_whether_errors_of_its_lights_last(
 
 
 @pytest.mark.parametrize(("rate_hz", "least"), [(10.0, LIKELY), (3.0, SURE)])
-def test_doubtful_lights_are_taken_where_the_next_picture_comes_soon(
+def test_doubtful_lights_are_taken_where_pictures_come_soon_after_each_other(
     monkeypatch: pytest.MonkeyPatch, rate_hz: float, least: float
 ) -> None:
     dive = make(9, Setting(seconds=12.0, rate_hz=rate_hz, near_m=4.0, far_m=8.0, false=0))

@@ -128,7 +128,7 @@ def test_pictures_are_weighed_together_by_all_the_dive_but_themselves() -> None:
 
 
 def test_what_a_slow_dive_says_of_a_picture_without_it_is_exact() -> None:
-    """Half a second without a unit: the picture tells a hundred times more than all others, and must be taken out."""
+    """A third of a second without a unit: the picture tells far more than all others, and must be taken out whole."""
     dive = make(9, Setting(seconds=12.0, rate_hz=3.0, near_m=4.0, far_m=8.0, false=0))
     dive = replace(dive, records=bare_of(dive))
     path, part, known = first_pass(dive)

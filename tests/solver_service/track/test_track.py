@@ -10,7 +10,7 @@ import pytest
 from buddyline.node.imu_means import ImuPacker
 from buddyline.protocol.messages import Imu
 from buddyline.solver_service.track import dive as dive_track
-from buddyline.solver_service.track import relax
+from buddyline.solver_service.track import settling
 from buddyline.solver_service.track.dive import smooth
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import FixSeen
@@ -250,7 +250,7 @@ def test_passes_that_diverge_are_no_track(monkeypatch: pytest.MonkeyPatch) -> No
         return replace(path, states=np.array([path.state(k).with_parts(clock_s=-0.7).row for k in range(len(path))]))
 
     assert list(smooth(short.records, short.fixes, short.stamps_ns).rows)
-    monkeypatch.setattr(relax, "smoothed", diverging)
+    monkeypatch.setattr(settling, "smoothed", diverging)
     found = smooth(short.records, short.fixes, short.stamps_ns)
     assert not list(found.rows)
     assert "contradict the first one" in found.problems[-1]
