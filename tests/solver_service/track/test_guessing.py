@@ -341,12 +341,12 @@ def test_lights_that_a_fix_refutes_are_kept_if_the_fix_is_wrong(
     """It contradicts what all other lights tell, too, and two passes show that."""
     pictures: list[int] = []
 
-    class Noted(PathPass):
+    class CountedPass(PathPass):
         def __init__(self, known: PassedOver, path: Path, *args: Any, **options: Any) -> None:
             pictures.append(sum(bool(look.chosen) for looks in path.looks for look in looks))
             super().__init__(known, path, *args, **options)
 
-    monkeypatch.setattr(settling, "PathPass", Noted)
+    monkeypatch.setattr(settling, "PathPass", CountedPass)
     _, *fixes = bare.fixes
     n = len(fixes) // 2
     wrong = [*fixes[:n], replace(fixes[n], t_a_b_m=1.5 * fixes[n].t_a_b_m), *fixes[n + 1 :]]
