@@ -22,9 +22,11 @@ from buddyline.solver_service.track.state import NAV, R_, State
 from numpy.typing import NDArray
 
 # A dive is passed over so often at most, until a pass moves no pose by so many sigmas: the next one would move none by
-# much more than a tenth of that. Tracks that began with single lamps, or late, settle more slowly.
+# much more than a tenth of that. Of a long dive's many poses a hundredth may move twice as far, or chance alone would
+# ask for another pass. Tracks that began with single lamps, or late, settle more slowly.
 PASSES: Final = 24
 STAYS_SIGMAS: Final = 1.0
+MAY_MOVE: Final = 0.01
 DOUBTFUL_SIGMAS: Final = 0.3
 LOOKED_AT: Final = 10
 # Where motion is guessed, a dive is passed over so often at least, for each pass learns more of it. The first pass
@@ -185,8 +187,12 @@ def clock_sigma_s(path: Path) -> float:
 
 
 def _stays(old: Path, new: Path, sigmas: float) -> bool:
-    """Whether a pass over a dive has left each pose within so many sigmas of where the pass before had it."""
+    """Whether a pass over a dive has left each pose, but MAY_MOVE of them, within so many sigmas of the pass before's.
+
+    Those are within twice as many.
+    """
     at = np.arange(0, len(new), LOOKED_AT)
     moved = State(new.states[at]).minus(State(old.states[at]))[:, :NAV, None]
     chi2 = np.swapaxes(moved, 1, 2) @ np.linalg.solve(new.covariance(at)[:, :NAV, :NAV], moved)
-    return bool((chi2 < NAV * sigmas**2).all())
+    limit = NAV * sigmas**2
+    return bool((chi2 < 4.0 * limit).all() and (chi2 >= limit).sum() <= MAY_MOVE * len(at))

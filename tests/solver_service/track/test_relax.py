@@ -21,7 +21,7 @@ from buddyline.solver_service.track.walking import Walking
 
 from tests.solver_service.track.assignments import weigh
 from tests.solver_service.track.dives import EPOCH_NS, KnownDive, Setting, bare_of, filter_of, make, score
-from tests.solver_service.track.test_guessing import first_pass
+from tests.solver_service.track.test_settling import first_pass
 
 
 def passed_about(dive: KnownDive, path: Path) -> Path:
