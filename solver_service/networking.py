@@ -223,9 +223,8 @@ class NetTracker:
             track.add_attitude(index, attitude)
         for depth in stream.depth.between(start_ns, end_ns):
             track.add_depth(index, DepthSeen(depth.stamp_ns, depth.depth_m, depth.sigma_m))
-        for frame in stream.frames.between(start_ns, end_ns):
-            if not frame.trigger % self.one_in:
-                track.add_frame(index, frame_of(view_of(frame)))
+        frames = [one for one in stream.frames.between(start_ns, end_ns) if not one.trigger % self.one_in]
+        track.add_frames(index, [frame_of(view_of(frame)) for frame in frames])
 
     def _message(self, row: NetRow) -> NodePose:
         node = self._nodes[row.node]

@@ -12,7 +12,7 @@ from typing import Final, TypeVar
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, Stamps, TrackNode
-from buddyline.solver_service.track.lights import Sight, sight_of
+from buddyline.solver_service.track.lights import Sight, sights_of
 from buddyline.solver_service.track.problems import Problems
 from buddyline.solver_service.track.samples import Samples
 from buddyline.solver_service.track.turning import Turning
@@ -99,7 +99,7 @@ class TrackIntake:
 
     def add_attitude(self, node: int, seen: AttitudeSeen) -> None:
         """Take an attitude message; sigmas that no attitude filter reaches are taken for unknown."""
-        if not (seen.sigma_rad > LEAST_SIGMA_RAD).all():
+        if not seen.sigma_rad.min() > LEAST_SIGMA_RAD:
             seen = replace(seen, sigma_rad=np.maximum(seen.sigma_rad, UNTOLD_SIGMA_RAD))
             said = f"node {self.nodes[node].name}: attitude sigmas of zero are taken as unknown"
             self._problems.report(said, self.seconds(node, seen.stamp_ns))
@@ -111,10 +111,11 @@ class TrackIntake:
         """Take a depth message."""
         bisect.insort(self.depths[node], (self.seconds(node, seen.stamp_ns), seen), key=_time_of)
 
-    def add_frame(self, node: int, frame: FrameSeen) -> None:
-        """Take a picture's candidates."""
-        t_s = self.seconds(node, frame.stamp_ns)
-        self._push(t_s, 1 + node, sight_of(self.nodes[node].rig, node, t_s, frame))
+    def add_frames(self, node: int, frames: Sequence[FrameSeen]) -> None:
+        """Take the candidates of pictures."""
+        times_s = [self.seconds(node, frame.stamp_ns) for frame in frames]
+        for sight in sights_of(self.nodes[node].rig, node, times_s, frames):
+            self._push(sight.t_s, 1 + node, sight)
 
     def add_fix(self, fix: FixSeen) -> None:
         """Take a pose that one trigger's lights gave by themselves; one out of numeric range is left out."""

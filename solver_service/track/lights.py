@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -117,16 +118,17 @@ def share_within(camera: Camera, X: Floats, D: Floats, P: Floats, margin_px: flo
     X (L, 3), D (L, 3, C): the lights and how errors of covariance P (C, C) move them, as `light_positions` gives them.
     The errors of u and v are taken to be independent.
     """
-    share = np.zeros(len(X))
-    size_px = np.array((camera.width_px, camera.height_px))
-    for light, pixel in enumerate(pixel_of(camera, each) for each in X):
-        if pixel is None:
-            continue
-        _, tangents = camera.rays(pixel[None])
-        J = tangents[0] @ D[light] / float(np.linalg.norm(X[light]))
-        reach_px = np.sqrt(2.0 * np.maximum((J @ P * J).sum(axis=1), SMALL_PX))
-        near, far = (margin_px - 0.5 - pixel) / reach_px, (size_px - 0.5 - margin_px - pixel) / reach_px
-        inside = math.prod(0.5 * (math.erf(b) - math.erf(a)) for a, b in zip(near.tolist(), far.tolist(), strict=True))
+    share, size_px = np.zeros(len(X)), np.array((camera.width_px, camera.height_px))
+    pixels = {light: pixel for light, each in enumerate(X) if (pixel := pixel_of(camera, each)) is not None}
+    if not pixels:
+        return share
+    lights, at = list(pixels), np.array(list(pixels.values()))
+    _, tangents = camera.rays(at)
+    J = tangents @ D[lights] / np.sqrt((X[lights] ** 2).sum(axis=1))[:, None, None]
+    reach_px = np.sqrt(2.0 * np.maximum((J @ P * J).sum(axis=2), SMALL_PX))
+    near, far = (margin_px - 0.5 - at) / reach_px, (size_px - 0.5 - margin_px - at) / reach_px
+    for light, below, above in zip(lights, near.tolist(), far.tolist(), strict=True):
+        inside = math.prod(0.5 * (math.erf(b) - math.erf(a)) for a, b in zip(below, above, strict=True))
         # The model of a distorted lens ends outside of the picture.
         share[light] = inside if inside > 0.0 else 0.0
     return share
@@ -189,24 +191,25 @@ def alike(lasting_s: float, apart_s: float) -> float:
     return 1.0 + lasting_s / max(apart_s, LEAST_APART_S)
 
 
-def sight_of(rig: Rig, node: int, t_s: float, frame: FrameSeen) -> Sight:
-    """Prepare a picture's candidates; those that the camera model does not reach are left out."""
+def sights_of(rig: Rig, node: int, times_s: Sequence[float], frames: Sequence[FrameSeen]) -> list[Sight]:
+    """Prepare the candidates of pictures at these times; those that the camera model does not reach are left out."""
+    if not frames:
+        return []
+    counts = [len(frame.pixels) for frame in frames]
     with np.errstate(all="ignore"):
-        bearings, tangents = rig.camera.rays(frame.pixels.reshape(-1, 2))
-    dt_s = np.zeros(len(frame.pixels))
-    if len(frame.dt_ns):
-        dt_s += frame.dt_ns * 1e-9
-    lasting_s = frame.lasting_s if len(frame.lasting_s) else np.zeros(len(frame.pixels))
-    sigma_px = frame.sigma_px
+        bearings, tangents = rig.camera.rays(np.concatenate([frame.pixels.reshape(-1, 2) for frame in frames]))
+    sigma_px = np.concatenate([frame.sigma_px for frame in frames])
     sound = np.isfinite(bearings).all(1) & np.isfinite(tangents).all((1, 2)) & np.isfinite(sigma_px) & (sigma_px > 0.0)
-    return Sight(
-        frame.stamp_ns,
-        t_s,
-        node,
-        bearings[sound],
-        tangents[sound],
-        sigma_px[sound],
-        dt_s[sound],
-        lasting_s[sound],
-        frame.elsewhere,
-    )
+    found, first = [], 0
+    for t_s, frame, count in zip(times_s, frames, counts, strict=True):
+        of, well = slice(first, first + count), sound[first : first + count]
+        first += count
+        dt_s = np.asarray(frame.dt_ns * 1e-9) if len(frame.dt_ns) else np.zeros(count)
+        lasting_s = frame.lasting_s if len(frame.lasting_s) else np.zeros(count)
+        bearing, tangent, sigma = bearings[of], tangents[of], sigma_px[of]
+        if not well.all():
+            bearing, tangent, sigma, dt_s, lasting_s = (
+                column[well] for column in (bearing, tangent, sigma, dt_s, lasting_s)
+            )
+        found.append(Sight(frame.stamp_ns, t_s, node, bearing, tangent, sigma, dt_s, lasting_s, frame.elsewhere))
+    return found

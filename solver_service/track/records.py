@@ -143,8 +143,7 @@ def feed(track: TrackIntake, node: int, record: NodeRecord) -> None:
         track.add_attitude(node, attitude)
     for depth in record.depths:
         track.add_depth(node, depth)
-    for frame in record.frames:
-        track.add_frame(node, frame)
+    track.add_frames(node, record.frames)
 
 
 def pass_over(

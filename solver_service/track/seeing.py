@@ -316,7 +316,7 @@ def found_now(estimate: Estimate, observer: int, t_s: float) -> Floats:
         return share.copy()
     kept = math.exp(-max(t_s - estimate.shown_s[observer], 0.0) / HIDDEN_S)
     found = share + kept * (estimate.shown[observer] - share)
-    return np.where(share > 0.0, np.clip(found, LEAST_FOUND, MOST_FOUND), 0.0)
+    return np.where(share > 0.0, np.minimum(np.maximum(found, LEAST_FOUND), MOST_FOUND), 0.0)
 
 
 def learn_found(
@@ -342,12 +342,11 @@ def light_rows(chosen: Chosen, y: Floats, H: Floats) -> tuple[Floats, Floats, Fl
 
     y, H: of all its candidates, as `residuals` gives them.
     """
+    k, light, variances = map(np.array, zip(*chosen, strict=True))
+    of_lights = H[k, light]
     rows_H = np.zeros((2 * len(chosen), SIZE))
-    of_lights = np.stack([H[k, light] for k, light, _ in chosen])
     rows_H[:, COLUMNS] = of_lights[..., :-1].reshape(2 * len(chosen), -1)
-    rows_y = np.concatenate([y[k, light] for k, light, _ in chosen])
-    variances = np.array([variance for _, _, variance in chosen])
-    return rows_H, rows_y, noise_of(variances, of_lights[..., -1], np.zeros(len(chosen)))
+    return rows_H, y[k, light].ravel(), noise_of(variances, of_lights[..., -1], np.zeros(len(chosen)))
 
 
 def counted(chosen: Chosen, sight: Sight, estimate: Estimate) -> Chosen:
@@ -364,7 +363,8 @@ def counted(chosen: Chosen, sight: Sight, estimate: Estimate) -> Chosen:
 
 def counted_more(chosen: Chosen, used: Chosen) -> Floats:
     """Give by how much the variances of lights (2 N,) count more than they are."""
-    return np.repeat([counts - variance for (*_, variance), (*_, counts) in zip(chosen, used, strict=True)], 2)
+    more = [counts - variance for (*_, variance), (*_, counts) in zip(chosen, used, strict=True)]
+    return np.array([more, more]).T.ravel()
 
 
 def note_lit(estimate: Estimate, sight: Sight, used: Chosen) -> None:
@@ -379,7 +379,9 @@ def noise_of(variances: Floats, by_time: Floats, pictures: NDArray[Any]) -> Floa
     variances (N,): px^2. by_time (N, 2): how they move in their pictures, px/s. pictures (N,): which one each is in.
     """
     late, of = STAMP_SIGMA_S * by_time.ravel(), np.repeat(pictures, 2)
-    return np.diag(np.repeat(variances, 2)) + np.where(of[:, None] == of, np.outer(late, late), 0.0)
+    noise: Floats = (late * (of[:, None] == of)) * late[:, None]
+    noise.ravel()[:: len(noise) + 1] += np.repeat(variances, 2)
+    return noise
 
 
 def stacked(rows: Sequence[tuple[Floats, Floats, Floats]]) -> tuple[Floats, Floats, Floats]:
@@ -394,7 +396,7 @@ def stacked(rows: Sequence[tuple[Floats, Floats, Floats]]) -> tuple[Floats, Floa
 
 def in_front(chosen: Chosen, y: Floats) -> Chosen:
     """Return those candidates of lights that the residuals y (K, 2, 2) have in front of the camera."""
-    return tuple(one for one in chosen if np.isfinite(y[one[0], one[1]]).all())
+    return tuple(one for one in chosen if math.isfinite(y[one[0], one[1], 0]))
 
 
 def _doubted(chosen: Chosen, start: Estimate, sight: Sight, H: Floats) -> Chosen:

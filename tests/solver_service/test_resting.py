@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -23,6 +23,7 @@ from buddyline.solver_service.geometry.fix import NoFix
 from buddyline.solver_service.geometry.observation import Sensed
 from buddyline.solver_service.resting import CROWD, LOOK_APART, LOOKS, NOT_IN_VIEW, REST_NS, Resting, look_apart
 from buddyline.solver_service.track.filter import TrackFilter
+from buddyline.solver_service.track.inputs import FrameSeen
 from buddyline.solver_service.tracking import TrackSettings
 from msgspec.structs import replace
 
@@ -124,7 +125,11 @@ def test_pictures_of_nodes_that_look_apart_start_no_track(
     """Also where the other node's picture of a trigger is lost."""
     lost = [one for one in three if isinstance(one, Candidates) and one.node == "c" and one.trigger % LOOKS == 1]
     fed: list[tuple[str, int]] = []
-    monkeypatch.setattr(TrackFilter, "add_frame", lambda self, _, frame: fed.append((self.both, frame.stamp_ns)))
+
+    def noted(self: TrackFilter, _: int, frames: Sequence[FrameSeen]) -> None:
+        fed.extend((self.both, frame.stamp_ns) for frame in frames)
+
+    monkeypatch.setattr(TrackFilter, "add_frames", noted)
     solver = SolverCore(SolveConfig().settings("test"), track=TrackSettings(frozenset({"filter"})))
     solver.handle_many([one for one in three if one not in lost])
     solver.flush()

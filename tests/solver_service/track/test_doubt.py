@@ -19,7 +19,7 @@ from buddyline.solver_service.track.lights import (
     light_positions,
     pixel_of,
     share_within,
-    sight_of,
+    sights_of,
 )
 from buddyline.solver_service.track.state import GYRO_BIAS, MOVING, PHI, SIZE, invariant_of_plain
 from buddyline.solver_service.track.sudden import SuddenTurn, with_sudden
@@ -164,7 +164,8 @@ def picture(track: TrackFilter, estimate: Estimate, turned_rad: Floats) -> Sight
     X, _ = light_positions(estimate.state, 0, lights_m, estimate.rates_radps, np.zeros(1))
     pixels = project(X[0] @ rotation_exp(turned_rad))
     assert all(in_picture(rig.camera, pixel, 2.0) for pixel in pixels)
-    return sight_of(rig, 0, estimate.t_s, FrameSeen(0, pixels, np.full(2, SIGMA_PX)))
+    [sight] = sights_of(rig, 0, [estimate.t_s], [FrameSeen(0, pixels, np.full(2, SIGMA_PX))])
+    return sight
 
 
 @pytest.mark.parametrize("turned_rad", [0.0, 0.04])
@@ -242,7 +243,7 @@ def test_a_picture_without_a_light_is_one_of_a_node_that_looks_away_until_it_sho
 ) -> None:
     track, known, calm = without_units
     estimate = known.copied()
-    nothing = sight_of(track.nodes[0].rig, 0, calm.t_s, FrameSeen(0, np.zeros((0, 2)), np.zeros(0)))
+    [nothing] = sights_of(track.nodes[0].rig, 0, [calm.t_s], [FrameSeen(0, np.zeros((0, 2)), np.zeros(0))])
     track._step(estimate, calm.t_s, nothing)
     assert estimate.looks_away[0]
     track._step(estimate, calm.t_s + 0.001, calm)

@@ -10,7 +10,7 @@ import pytest
 from buddyline.solver_service.track.dive import _unrest, smooth
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.inputs import FrameSeen
-from buddyline.solver_service.track.lights import sight_of
+from buddyline.solver_service.track.lights import sights_of
 from buddyline.solver_service.track.records import last_ns
 from buddyline.solver_service.track.seeing import counted, counted_more, note_lit
 from buddyline.solver_service.track.state import SIZE, State
@@ -42,7 +42,7 @@ def test_errors_of_lights_that_last_count_once_where_the_node_tells_of_them(poor
 
 def test_a_light_whose_error_lasts_counts_by_when_it_was_last_used(dive: KnownDive) -> None:
     frame = FrameSeen(0, np.full((2, 2), 300.0), np.full(2, 0.7), lasting_s=np.array((0.0, 1.5)))
-    sight = sight_of(dive.records[0].node.rig, 0, 1.2, frame)
+    [sight] = sights_of(dive.records[0].node.rig, 0, [1.2], [frame])
     estimate = Estimate(
         1.0, State.at_rest(np.zeros(3), np.eye(3)[None].repeat(2, 0)), np.eye(SIZE), 1.0, confirmed=True
     )

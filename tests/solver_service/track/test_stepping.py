@@ -19,7 +19,7 @@ from buddyline.solver_service.track.association import Association, associate
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import FrameSeen
-from buddyline.solver_service.track.lights import COLUMNS, Sight, light_positions, residuals, sight_of
+from buddyline.solver_service.track.lights import COLUMNS, Sight, light_positions, residuals, sights_of
 from buddyline.solver_service.track.moving import HOLD_S, KNOWN_CLOCK_S
 from buddyline.solver_service.track.records import last_ns
 from buddyline.solver_service.track.seeing import _widened, light_rows, noise_of, stacked
@@ -50,7 +50,7 @@ def test_a_picture_of_a_counts_the_product_of_clock_and_velocity_errors() -> Non
     rig = make(1, Setting(seconds=1.0)).records[0].node.rig
     X, D = light_positions(state, 0, LIGHTS_M, np.zeros((2, 3)), np.zeros(1))
     pixel = np.array((409.5, 307.5)) + 900.0 * X[0, 0, :2] / X[0, 0, 2]
-    sight = sight_of(rig, 0, 0.0, FrameSeen(0, pixel[None], np.array((0.7,))))
+    [sight] = sights_of(rig, 0, [0.0], [FrameSeen(0, pixel[None], np.array((0.7,)))])
     y0, H0 = of_light(state, sight)
     of_errors = np.r_[CLOCK, V_]
     P = np.zeros((SIZE, SIZE))
@@ -186,7 +186,7 @@ def known_pair() -> tuple[TrackFilter, Estimate, list[Sight]]:
         rig, lights_m = track.nodes[node].rig, track.nodes[1 - node].rig.lights_m
         X, _ = light_positions(known.state, node, lights_m, known.rates_radps, np.zeros(1))
         pixels = np.array((409.5, 307.5)) + 900.0 * X[0, :, :2] / X[0, :, 2:]
-        sights.append(sight_of(rig, node, known.t_s, FrameSeen(0, pixels, np.full(2, 0.7))))
+        sights += sights_of(rig, node, [known.t_s], [FrameSeen(0, pixels, np.full(2, 0.7))])
     return track, known, sights
 
 

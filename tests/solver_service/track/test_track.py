@@ -146,7 +146,7 @@ def fed(dive: KnownDive, order: random.Random | None, chunk_ns: int, window_ns: 
             calls.append((stamp, track.add_imu, data))
         calls += [(seen.stamp_ns, track.add_attitude, (node, seen)) for seen in record.attitudes]
         calls += [(seen.stamp_ns, track.add_depth, (node, seen)) for seen in record.depths]
-        calls += [(frame.stamp_ns, track.add_frame, (node, frame)) for frame in record.frames]
+        calls += [(frame.stamp_ns, track.add_frames, (node, [frame])) for frame in record.frames]
     calls += [(fix.stamp_ns, track.add_fix, (fix,)) for fix in dive.fixes]
     calls.sort(key=lambda call: call[0])
     if order:
