@@ -38,11 +38,13 @@ class Association:
     chosen: (candidate, light, variance in px^2) of those that are sure or likely; the variance is that of the mixture
     where a gross error cannot be told from a common one, or the light may be elsewhere. seen (L,): the probability that
     each light is among the candidates. evidence: log of the picture's probability over that of clutter alone.
+    ambiguous: whether a candidate may well be either light.
     """
 
     chosen: tuple[tuple[int, int, float], ...]
     seen: Floats
     evidence: float
+    ambiguous: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,11 +97,13 @@ class Odds:
                     seen[light] += weight
                     marginal.setdefault((picked[0], light), [0.0, 0.0])[picked[1]] += weight
         chosen: list[tuple[int, int, float]] = []
+        # Further pictures like this one tell no better which light a candidate is: it is left out, not guessed.
+        ambiguous = {k for k, _ in marginal if all(sum(marginal.get((k, light), ())) > 1.0 - SURE for light in (0, 1))}
         for (k, light), (common, gross) in sorted(marginal.items()):
-            if common + gross > least:
+            if common + gross > least and k not in ambiguous:
                 doubt_px2 = 0.0 if common + gross > SURE else self._doubt_px2(k, light, marginal)
                 chosen.append((k, light, variance_of(float(sigma_px[k]), common, gross) + doubt_px2))
-        return Association(tuple(chosen), np.array(seen), top + math.log(total))
+        return Association(tuple(chosen), np.array(seen), top + math.log(total), bool(ambiguous))
 
     def _doubt_px2(self, k: int, light: int, marginal: Mapping[tuple[int, int], Sequence[float]]) -> float:
         """Give what the variance of a light, candidate k, gains because it may be another candidate or none.

@@ -297,7 +297,7 @@ class PathPass(TrackSteps):
         within, least = np.array(inside, dtype=float), SURE if slow else LIKELY
         found = by_path.odds.associate(sight.sigma_px, detection, within, least)
         main.evidence += found.evidence
-        learn_found(main, observer, sight.t_s, detection, inside, found.seen)
+        learn_found(main, observer, sight.t_s, detection, inside, found)
         if all(inside):
             self.lamps.take(1 - observer, sight.t_s, found.seen)
         return replace(found, chosen=in_front(found.chosen, by_path.y))

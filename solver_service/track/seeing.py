@@ -147,7 +147,7 @@ class TrackSights(TrackMoves):
         elif any(inside) and not wide:
             estimate.missed[observer] += 1
         estimate.last_seen = found.seen if all(inside) and not wide else None
-        learn_found(estimate, observer, sight.t_s, detection, inside, found.seen)
+        learn_found(estimate, observer, sight.t_s, detection, inside, found)
         estimate.looks_away[observer] = not found.chosen
         if found.chosen:
             if not estimate.confirmed:
@@ -320,13 +320,16 @@ def found_now(estimate: Estimate, observer: int, t_s: float) -> Floats:
 
 
 def learn_found(
-    estimate: Estimate, observer: int, t_s: float, found: Floats, inside: Sequence[bool], seen: Floats
+    estimate: Estimate, observer: int, t_s: float, found: Floats, inside: Sequence[bool], association: Association
 ) -> None:
     """Take into an estimate whether each light that should be in a picture was seen there (2,).
 
     found (2,): how likely that was, by `found_now`. A lamp that is not seen may be in view and missed, too.
     """
     estimate.shown[observer], estimate.shown_s[observer] = found, t_s
+    if association.ambiguous:
+        return
+    seen = association.seen
     for light in (0, 1):
         share = estimate.detection[observer, light]
         if inside[light] and share > 0.0:

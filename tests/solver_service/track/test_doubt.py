@@ -106,6 +106,20 @@ def test_a_light_that_may_well_be_another_is_left_out() -> None:
     assert 0.5 < LIKELY < SURE
 
 
+@pytest.mark.parametrize(("apart_px", "known"), [(60.0, False), (130.0, False), (300.0, True)])
+def test_a_lone_light_must_be_sure_not_to_be_the_other_of_its_bar(apart_px: float, known: bool) -> None:
+    """Pictures that are alike tell it no better, and so one after the other must not tell which lamp is hidden."""
+    H, P = np.broadcast_to(ALIKE, (1, 2, 2, 2)), 60.0**2 * np.eye(2)
+    y = np.array((((30.0, 0.0), (30.0 + apart_px, 0.0)),))
+    lit, lone = np.array((0.75, 0.75)), np.full(1, SIGMA_PX)
+    found = associate(y, H, P, lone, lit, 1.0 / AREA_PX2, least=LIKELY)
+    assert found.seen[0] > 0.5 * found.seen.sum()
+    assert found.ambiguous is not known
+    assert [one[:2] for one in found.chosen] == ([(0, 0)] if known else [])
+    # Where the other one is known to be dark nothing is ambiguous.
+    assert not associate(y, H, P, lone, LEFT_LIT, 1.0 / AREA_PX2, least=LIKELY).ambiguous
+
+
 def test_a_light_that_may_be_outside_of_the_picture_is_found_less_surely_and_missed_less() -> None:
     y, H = np.zeros((1, 2, 2)), np.broadcast_to(ALIKE, (1, 2, 2, 2))
     P, sigma, found = 20.0**2 * np.eye(2), np.full(1, SIGMA_PX), np.array((0.9, 0.0))
@@ -146,13 +160,17 @@ def test_a_light_behind_the_camera_is_not_within_the_picture() -> None:
 
 @pytest.fixture(scope="module")
 def without_units() -> tuple[TrackFilter, Estimate, Sight]:
-    """Give a filter of a dive without units, its confirmed estimate, and A's next picture as that predicts it."""
-    dive = make(1, Setting(seconds=6.0, false=0))
+    """Give a filter of a dive without units, its confirmed estimate, and A's next picture as that predicts it.
+
+    Both nodes' last pictures show lamps that are surely known.
+    """
+    dive = make(3, Setting(seconds=6.0, false=0))
     track = filter_of(bare_of(dive), dive.fixes)
     track.advance(dive.stamps_ns[-1])
     known = track.main
     assert known is not None
     assert known.confirmed
+    assert not any(known.looks_away)
     later = known.copied()
     track._step(later, known.t_s + 0.1, None)
     return track, known, picture(track, later, np.zeros(3))
@@ -251,13 +269,14 @@ def test_a_picture_without_a_light_is_one_of_a_node_that_looks_away_until_it_sho
 
 
 def test_a_start_uses_no_light_that_is_only_likely(without_units: tuple[TrackFilter, Estimate, Sight]) -> None:
+    """It knows the only lit lamp to some 70 px, and clutter is all about."""
     track, known, calm = without_units
+    columns = {name: getattr(calm, name)[:1] for name in ("bearings", "tangents", "sigma_px", "dt_s", "lasting_s")}
     used = []
     for confirmed in (True, False):
-        estimate = known.copied(confirmed=confirmed, detection=np.full((2, 2), 0.3))
-        # Its lights are some 100 px wide, and clutter is all about.
+        estimate = known.copied(confirmed=confirmed, detection=np.array(((0.3, 0.0), (0.3, 0.3))))
         estimate.covariance = known.covariance + np.diag(np.isin(np.arange(SIZE), range(3)) * 0.25)
-        track._step(estimate, calm.t_s, replace(calm, elsewhere=14))
+        track._step(estimate, calm.t_s, replace(calm, **columns, elsewhere=30))
         used.append([variance for _, _, variance in estimate.steps.last.looks[0].chosen])
     assert max(used[0]) > 7.0**2
     assert not used[1] or max(used[1]) < 7.0**2

@@ -11,6 +11,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import LightTruth, NodePose, Truth
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.trigger import Settings
+from buddyline.solver_service.track.association import Association
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.lamps import LampWatch
 from buddyline.solver_service.track.seeing import found_now, learn_found
@@ -91,13 +92,16 @@ def test_a_lamp_of_nobody_is_refused():
         Scenario(dead_lamps=("c.left",))
 
 
-def looked(pictures, first=0.8, second=0.8):
-    """What node a has learned at 10 Hz, from 0.1 s on: by what is seen of each light, and what should be in view."""
+def looked(pictures, first=0.8, second=0.8, *, ambiguous=False):
+    """What node a has learned at 10 Hz, from 0.1 s on: by what is seen of each light, and what should be in view.
+
+    ambiguous: whether a candidate may well be either light in each picture.
+    """
     state = State.at_rest(np.zeros(3), np.stack((np.eye(3), np.eye(3))))
     told = Estimate(0.0, state, np.eye(SIZE), 0.0, confirmed=True, detection=np.array(((first, second), (0.8, 0.8))))
     for k, (seen, inside) in enumerate(pictures):
         t_s = 0.1 * (k + 1)
-        learn_found(told, 0, t_s, found_now(told, 0, t_s), inside, np.array(seen))
+        learn_found(told, 0, t_s, found_now(told, 0, t_s), inside, Association((), np.array(seen), 0.0, ambiguous))
     return told, 0.1 * len(pictures)
 
 
@@ -132,3 +136,13 @@ def test_a_lamp_that_is_hidden_or_in_view_mostly_stays_so(pictures, next_s, leas
     told, now_s = looked(pictures)
     assert least < found_now(told, 0, now_s + next_s)[0] < most
     assert found_now(told, 0, now_s + next_s)[1] == pytest.approx(0.96, abs=0.02)
+
+
+def test_which_of_two_lamps_is_hidden_is_not_learned_from_one_that_may_be_either():
+    """All such pictures have their cause in common: each would add to the same doubt."""
+    doubt = [((0.4, 0.6), (True, True))] * 20
+    told, now_s = looked(doubt, ambiguous=True)
+    assert found_now(told, 0, now_s).tolist() == pytest.approx([0.8, 0.8])
+    assert told.shown_s[0] == pytest.approx(now_s)
+    told, now_s = looked(doubt, ambiguous=False)
+    assert found_now(told, 0, now_s).tolist() == pytest.approx([0.4, 0.6], abs=0.05)
