@@ -97,7 +97,7 @@ class Odds:
                     seen[light] += weight
                     marginal.setdefault((picked[0], light), [0.0, 0.0])[picked[1]] += weight
         chosen: list[tuple[int, int, float]] = []
-        # Further pictures like this one tell no better which light a candidate is: it is left out, not guessed.
+        # Which light such a candidate is, the next pictures mostly tell no better: it is left out, not guessed.
         ambiguous = {k for k, _ in marginal if all(sum(marginal.get((k, light), ())) > 1.0 - SURE for light in (0, 1))}
         for (k, light), (common, gross) in sorted(marginal.items()):
             if common + gross > least and k not in ambiguous:

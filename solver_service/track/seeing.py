@@ -324,7 +324,8 @@ def learn_found(
 ) -> None:
     """Take into an estimate whether each light that should be in a picture was seen there (2,).
 
-    found (2,): how likely that was, by `found_now`. A lamp that is not seen may be in view and missed, too.
+    found (2,): how likely that was, by `found_now`. A lamp that is not seen may be in view and missed, too. A picture
+    with a candidate that may be either light teaches nothing: the next ones would repeat what it says of the two.
     """
     estimate.shown[observer], estimate.shown_s[observer] = found, t_s
     if association.ambiguous:

@@ -22,8 +22,8 @@ from buddyline.solver_service.track.state import NAV, R_, State
 from numpy.typing import NDArray
 
 # A dive is passed over so often at most, until a pass moves no pose by so many sigmas: the next one would move none by
-# much more than a tenth of that. Of a long dive's many poses a hundredth may move twice as far, or chance alone would
-# ask for another pass. Tracks that began with single lamps, or late, settle more slowly.
+# much more than a tenth of that. Of a long dive's many poses some mostly move further, and would cost another pass over
+# all of it: so a hundredth may move twice as far. Tracks that began with single lamps, or late, settle more slowly.
 PASSES: Final = 24
 STAYS_SIGMAS: Final = 1.0
 MAY_MOVE: Final = 0.01

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log
+from buddyline.solver_service.track import seeing
 from buddyline.solver_service.track.association import LIKELY, SURE, Association, associate
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
@@ -279,4 +280,19 @@ def test_a_start_uses_no_light_that_is_only_likely(without_units: tuple[TrackFil
         track._step(estimate, calm.t_s, replace(calm, **columns, elsewhere=30))
         used.append([variance for _, _, variance in estimate.steps.last.looks[0].chosen])
     assert max(used[0]) > 7.0**2
-    assert not used[1] or max(used[1]) < 7.0**2
+    assert not used[1]
+
+
+def test_a_picture_of_a_lamp_that_may_be_either_teaches_not_which_is_hidden(
+    without_units: tuple[TrackFilter, Estimate, Sight], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    track, known, calm = without_units
+    shown = []
+    for ambiguous in (True, False):
+        told = Association((), np.array((0.3, 0.7)), 0.0, ambiguous)
+        monkeypatch.setattr(seeing, "associate", lambda *_, told=told: told)
+        estimate = known.copied(detection=np.full((2, 2), 0.8), shown=np.full((2, 2), 0.8))
+        track._step(estimate, calm.t_s, calm)
+        shown.append(float(np.ptp(estimate.shown[0])))
+    assert shown[0] == pytest.approx(0.0, abs=1e-9)
+    assert shown[1] > 0.2

@@ -139,7 +139,7 @@ def test_a_lamp_that_is_hidden_or_in_view_mostly_stays_so(pictures, next_s, leas
 
 
 def test_which_of_two_lamps_is_hidden_is_not_learned_from_one_that_may_be_either():
-    """All such pictures have their cause in common: each would add to the same doubt."""
+    """Such pictures have a cause in common: each would add to the same doubt."""
     doubt = [((0.4, 0.6), (True, True))] * 20
     told, now_s = looked(doubt, ambiguous=True)
     assert found_now(told, 0, now_s).tolist() == pytest.approx([0.8, 0.8])

@@ -95,6 +95,20 @@ def test_a_pass_that_keeps_the_lights_learns_nothing_of_how_likely_they_are_foun
     assert track.passed.told > 200
 
 
+@pytest.mark.parametrize(("ambiguous", "least", "most"), [(True, 0.0, 1e-9), (False, 0.12, 0.4)])
+def test_a_pass_does_not_learn_which_lamp_is_hidden_from_one_that_may_be_either(
+    bare: KnownDive, monkeypatch: pytest.MonkeyPatch, ambiguous: bool, least: float, most: float
+) -> None:
+    path, part, known = first_pass(bare)
+    told = Association((), np.array((0.3, 0.7)), 0.0, ambiguous)
+    monkeypatch.setattr(Odds, "associate", lambda *_: told)
+    track = PathPass(known, path, np.full((2, 2), 0.5), part.shaking)
+    pass_over(track, known.records, ())
+    apart = np.ptp(track.passed.detection, axis=1)
+    assert (least <= apart).all()
+    assert (apart < most).all()
+
+
 def test_a_whole_dives_passes_know_its_fixes(bare: KnownDive, monkeypatch: pytest.MonkeyPatch) -> None:
     counts: list[tuple[int, int]] = []
 
