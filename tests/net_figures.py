@@ -149,7 +149,7 @@ def told(grade: Grade) -> Iterator[None]:
     shaken: dict[str, Any] = {}
     if not grade.shake_radps:
         still = np.full(2, 2.0 * math.log(1e-6))
-        shaken = {"SHAKE_RAD": 1e-6, "SHOVE_MPS": 1e-6, "_BOUNDS": (still, still)}
+        shaken = {"_FIRST": still, "_BOUNDS": (still, still)}
     with (
         patch.multiple(state, **sigmas),
         # Its samples have no error but those here.

@@ -344,14 +344,15 @@ class NetBelief:
 
     # Sensors
 
-    def _apply(self, H: Floats, y: Floats, noise: Floats, *, teaches: bool = False) -> None:
+    def _apply(self, H: Floats, y: Floats, noise: Floats, doubts: Floats | None = None) -> None:
+        """Update by residuals. doubts (m,): of lights, which teach shaking, as of `track/seeing.told_by`."""
         assert self.state is not None
-        before = self.covariance
-        error, self.covariance, _, S_inverse, gain = anchors.kalman(before, H, y, noise)
+        error, self.covariance, _, S_inverse, gain = anchors.kalman(self.covariance, H, y, noise)
         if self.trail is not None:
             self.trail.events.append(Learned(H, gain, S_inverse, y))
-        if teaches:
-            self.shaking = self.shaking.taught(y, S_inverse, H, before)
+        if doubts is not None:
+            of_all = np.linalg.inv(np.linalg.inv(S_inverse) - np.diag(doubts)) if doubts.any() else S_inverse
+            self.shaking = self.shaking.taught(y, of_all, H, gain)
         self.state = self.state.plus(error)
 
     def _take_depths(self) -> None:

@@ -14,27 +14,26 @@ import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.network.state import MOVING, P_, PHI, SHAKE, SHOVE, V_
 from buddyline.solver_service.track.shaking import (
-    FIRST,
+    FIRST_LOGS,
     LEAST,
-    LONGEST_STEP,
     MOST,
     MOST_CHI2,
-    SHAKE_RAD,
     SHAKEN_S,
-    SHOVE_MPS,
     kept_share,
+    learned,
+    nothing_learned,
 )
 
 # A picture's weight is halved after so many more of each member.
 HALVED: Final = 100.0
-_BOUNDS: Final = np.array((LEAST[0], LEAST[2])), np.array((MOST[0], MOST[2]))
+_FIRST, *_BOUNDS = (np.array((logs[0], logs[2])) for logs in (FIRST_LOGS, LEAST, MOST))
 _I: Final = np.eye(3)
 
 
 @dataclass(frozen=True, eq=False)
 class NetShaking:
-    """Logs of the variances (n, 2), their information (2 n, 2 n), and parts (n, 2, MOVING, MOVING): what of each
-    member's covariance comes from each."""
+    """Logs of the variances (n, 2), their information (2, 2 n, 2 n), as `track/shaking.learned` has it, and parts
+    (n, 2, MOVING, MOVING): what of each member's covariance comes from each."""
 
     logs: Floats
     information: Floats
@@ -43,7 +42,7 @@ class NetShaking:
     @classmethod
     def of_none(cls) -> NetShaking:
         """Return that of no members."""
-        return cls(np.zeros((0, 2)), np.zeros((0, 0)), np.zeros((0, 2, MOVING, MOVING)))
+        return cls(np.zeros((0, 2)), nothing_learned(0), np.zeros((0, 2, MOVING, MOVING)))
 
     @property
     def variances(self) -> Floats:
@@ -54,25 +53,26 @@ class NetShaking:
         """Return it with one more member. told (2,): the logs of its variances by an earlier pass, None where nothing
         is known of it."""
         n = len(self.logs)
-        information = np.zeros((2 * n + 2, 2 * n + 2))
-        information[: 2 * n, : 2 * n] = self.information
-        information[2 * n :, 2 * n :] = 0.5 * FIRST * np.eye(2)
-        first = 2.0 * np.log(np.array(((SHAKE_RAD, SHOVE_MPS),))) if told is None else told[None]
+        information = nothing_learned(2 * n + 2)
+        information[:, : 2 * n, : 2 * n] = self.information
+        first = _FIRST if told is None else told
         more = np.zeros((1, 2, MOVING, MOVING))
-        return NetShaking(np.concatenate((self.logs, first)), information, np.concatenate((self.parts, more)))
+        return NetShaking(np.concatenate((self.logs, first[None])), information, np.concatenate((self.parts, more)))
 
     def chosen(self, members: list[int]) -> NetShaking:
         """Return it for some members."""
         which = [2 * member + k for member in members for k in (0, 1)]
-        return NetShaking(self.logs[members], self.information[np.ix_(which, which)], self.parts[members])
+        return NetShaking(self.logs[members], self.information[np.ix_((0, 1), which, which)], self.parts[members])
 
     def moved(self, F: Floats, drawn: Floats) -> NetShaking:
         """Go on by a step of the members: F (n, MOVING, MOVING), and what it adds, (n, 2, MOVING, MOVING)."""
         onward = F[:, None]
         return NetShaking(self.logs, self.information, onward @ self.parts @ np.swapaxes(onward, -1, -2) + drawn)
 
-    def taught(self, y: Floats, S_inverse: Floats, H: Floats, P: Floats) -> NetShaking:
-        """Go on by one picture's residuals y (m,), H (m, N), P (N, N), by Fisher's scoring (Shaking.taught).
+    def taught(self, y: Floats, S_inverse: Floats, H: Floats, gain: Floats) -> NetShaking:
+        """Go on by one picture's residuals y (m,), H (m, N), by Fisher's scoring (Shaking.taught).
+
+        gain (N, m): of the update. S_inverse (m, m): of the residuals, as they are to be learned from.
 
         A node's part does not follow what an update makes of it in other nodes' errors. Between nodes whose places are
         poorly known, but together, it could grow without an end. It is kept within S: tr(S^-1 D) <= rank D.
@@ -82,20 +82,18 @@ class NetShaking:
         D = (H_own[:, None] @ self.parts @ np.swapaxes(H_own, 1, 2)[:, None]).reshape(2 * n, m, m)
         W = S_inverse @ D
         rank = np.repeat(np.clip(H_own.any(axis=2).sum(axis=1), 1, MOVING), 2)
-        share = np.trace(W, axis1=1, axis2=2) * self.variances.ravel() / rank
+        share = np.trace(W, axis1=1, axis2=2) / rank
         above = np.maximum(share, 1.0)[:, None, None]
         D, W, own = D / above, W / above, self.parts / above.reshape(n, 2, 1, 1)
         z = S_inverse @ y
         z = z * math.sqrt(min(1.0, MOST_CHI2 * m / max(float(y @ z), 1e-9)))
         slope = 0.5 * (D @ z @ z - np.trace(W, axis1=1, axis2=2))
         fisher = 0.5 * (W.reshape(2 * n, -1) @ np.swapaxes(W, 1, 2).reshape(2 * n, -1).T)
-        kept = 0.5 ** (1.0 / (HALVED * n))
-        information = kept * self.information + fisher + (1.0 - kept) * 0.5 * FIRST * np.eye(2 * n)
-        step = np.clip(np.linalg.solve(information, slope), -LONGEST_STEP, LONGEST_STEP).reshape(n, 2)
-        gain = (P @ H.T @ S_inverse)[1:].reshape(n, -1, m)[:, :MOVING]
-        rest = (np.eye(MOVING) - gain @ H_own)[:, None]
+        kept, first = 0.5 ** (1.0 / (HALVED * n)), np.tile(_FIRST, n)
+        logs, information = learned(self.logs.ravel(), self.information, slope, fisher, first, kept)
+        rest = (np.eye(MOVING) - gain[1:].reshape(n, -1, m)[:, :MOVING] @ H_own)[:, None]
         parts = rest @ own @ np.swapaxes(rest, -1, -2)
-        return NetShaking(np.clip(self.logs + step, *_BOUNDS), information, parts)
+        return NetShaking(np.clip(logs.reshape(n, 2), *_BOUNDS), information, parts)
 
 
 def shaking_parts(R: Floats, span_s: Floats) -> Floats:

@@ -32,6 +32,7 @@ from buddyline.solver_service.track.seeing import (
     PassGuide,
     counted,
     counted_more,
+    doubted,
     found_now,
     in_front,
     learn_found,
@@ -238,6 +239,7 @@ class PathPass(TrackSteps):
         main = self.passed
         rows: list[tuple[Floats, Floats, Floats]] = []
         more: list[Floats] = []
+        doubts: list[Floats] = []
         looks: list[Look] = []
         lights: list[tuple[float, int, int]] = []
         depth = self._depth_of(main, step.t_s)
@@ -247,6 +249,7 @@ class PathPass(TrackSteps):
             if off * off < DEPTH_GATE * (float(H[0] @ main.covariance @ H[0]) + variance):
                 rows.append((H, y, np.array(((variance,),))))
                 more.append(np.zeros(1))
+                doubts.append(np.zeros(1))
         for sight, by_path in seen:
             main.trigger = [one for one in main.trigger if abs(sight.t_s - one[0]) < ONE_TRIGGER_S]
             found = self._associated(sight, by_path)
@@ -254,6 +257,7 @@ class PathPass(TrackSteps):
             residuals = None
             if found.chosen:
                 more.append(counted_more(found.chosen, counts))
+                doubts.append(doubted(found.chosen, sight))
                 note_lit(main, sight, counts)
                 H, y, noise = light_rows(found.chosen, by_path.y, by_path.H)
                 rows.append((H, y, noise))
@@ -267,8 +271,8 @@ class PathPass(TrackSteps):
         if rows:
             H, y, noise = stacked(rows)
             others = len(y) - 2 * len(lights)
-            y, beside = y - H @ self._off, np.concatenate(more)
-            error, chi2 = told_by(main, H, y, noise, beside, teaches=bool(lights), others=others)
+            y, of_lights = y - H @ self._off, np.concatenate(doubts) if lights else None
+            error, chi2 = told_by(main, H, y, noise, np.concatenate(more), of_lights, others=others)
             self._off = self._off + error
             if lights:
                 main.surprise += chi2

@@ -11,7 +11,7 @@ import numpy as np
 from buddyline.solver_service.geometry.observation import STAMP_SIGMA_S
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track import anchors
-from buddyline.solver_service.track.association import LIKELY, SURE, Association, Odds, associate, odds_of
+from buddyline.solver_service.track.association import LIKELY, SURE, Association, Odds, associate, doubts_of, odds_of
 from buddyline.solver_service.track.estimate import REFLECTED_S, Estimate
 from buddyline.solver_service.track.inputs import TrackNode
 from buddyline.solver_service.track.lights import (
@@ -250,7 +250,8 @@ class TrackSights(TrackMoves):
         used = counted(found.chosen, sight, estimate)
         rows_H, rows_y, noise = light_rows(found.chosen, y, H)
         more = counted_more(found.chosen, used)
-        error, chi2 = told_by(estimate, rows_H, rows_y, noise, more, teaches=True)
+        doubts = doubted(found.chosen, sight) if estimate.confirmed else np.zeros(len(rows_y))
+        error, chi2 = told_by(estimate, rows_H, rows_y, noise, more, doubts)
         estimate.state = estimate.state.plus(error)
         estimate.lasted += 2 * sum(float(sight.lasting_s[k]) > 0.0 for k, *_ in found.chosen)
         note_lit(estimate, sight, used)
@@ -272,14 +273,15 @@ def told_by(
     y: Floats,
     noise: Floats,
     more: Floats | None = None,
+    doubts: Floats | None = None,
     *,
-    teaches: bool = False,
     others: int = 0,
 ) -> tuple[Floats, float]:
     """Update all but an estimate's state; give the error (SIZE,) to add to that, and chi^2 of the residuals y (m,).
 
-    more (m,): by how much variances count more than they are, in all but chi^2. teaches: whether shaking and shares
-    learn. others: how many rows, the first ones, are not of lights.
+    more (m,): by how much variances count more than they are, in all but chi^2. doubts (m,): of lights, which teach
+    shaking and shares: what their variances have for doubts that shaking does not share. others: how many rows, the
+    first ones, are not of lights.
     """
     before = estimate.covariance
     if more is None or not more.any():
@@ -289,7 +291,7 @@ def told_by(
         chi2 = float(y @ np.linalg.solve(H @ before @ H.T + noise, y))
     if estimate.learns and estimate.by_shares.any():
         moved = H @ estimate.by_shares
-        if teaches:
+        if doubts is not None:
             estimate.shares = estimate.shares.taught(y, S_inverse, moved)
         estimate.by_shares = estimate.by_shares - gain @ moved
     if estimate.follows_walk:
@@ -297,9 +299,10 @@ def told_by(
         estimate.walking = estimate.walking.taught(y, S_inverse, H, gain, learns=learns)
     # Depth and attitudes remove little of what shaking adds: to follow that would not be worth its time. Without the
     # gauges' offset, which is not followed, depth would even add to it, more each time.
-    if teaches:
+    if doubts is not None:
         moving = H[:, :MOVING]
-        estimate.shaking = estimate.shaking.taught(y, S_inverse, moving[:, :NAV], estimate.shaken[:, :NAV, :NAV])
+        of_all = np.linalg.inv(np.linalg.inv(S_inverse) - np.diag(doubts)) if doubts.any() else S_inverse
+        estimate.shaking = estimate.shaking.taught(y, of_all, moving[:, :NAV], estimate.shaken[:, :NAV, :NAV])
         rest = _STILL - gain[:MOVING, others:] @ moving[others:]
         estimate.shaken = rest @ estimate.shaken @ rest.T
     return error, chi2
@@ -369,6 +372,12 @@ def counted_more(chosen: Chosen, used: Chosen) -> Floats:
     """Give by how much the variances of lights (2 N,) count more than they are."""
     more = [counts - variance for (*_, variance), (*_, counts) in zip(chosen, used, strict=True)]
     return np.array([more, more]).T.ravel()
+
+
+def doubted(chosen: Chosen, sight: Sight) -> Floats:
+    """Give what the variances of lights (2 N,) have for doubts, by `doubts_of`."""
+    k, _, variances = map(np.array, zip(*chosen, strict=True))
+    return np.repeat(doubts_of(variances, sight.sigma_px[k]), 2)
 
 
 def note_lit(estimate: Estimate, sight: Sight, used: Chosen) -> None:

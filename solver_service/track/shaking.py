@@ -22,7 +22,8 @@ SHAKEN_S: Final = 0.1
 # much as FIRST residuals.
 SHAKE_RAD: Final = 1e-3
 SHOVE_MPS: Final = 1e-2
-FIRST: Final = 0.5
+FIRST: Final = 2.0
+FIRST_LOGS: Final = 2.0 * np.log(np.array((SHAKE_RAD, SHAKE_RAD, SHOVE_MPS)))
 LEAST: Final = np.log(np.array((5e-5, 5e-5, 5e-4)) ** 2)
 MOST: Final = np.log(np.array((0.03, 0.03, 0.3)) ** 2)
 # A picture's weight is halved after 200 more, which two nodes take in 10 s at 10 Hz: shaking comes and goes.
@@ -32,15 +33,17 @@ LONGEST_STEP: Final = 0.5
 MOST_CHI2: Final = 9.0
 # So much of the shaking is taken to be left at least where a share of the samples' fast part is taken off.
 LEAST_LEFT: Final = 0.2
-_IDENTITY: Final = np.eye(3)
 
 
 @dataclass(frozen=True, eq=False)
 class Shaking:
-    """Logs of three variances, both units' angles (rad^2) and the velocity between them; and their information."""
+    """Logs of three variances, both units' angles (rad^2) and the velocity between them.
 
-    logs: Floats = field(default_factory=lambda: 2.0 * np.log(np.array((SHAKE_RAD, SHAKE_RAD, SHOVE_MPS))))
-    information: Floats = field(default_factory=lambda: 0.5 * FIRST * np.eye(3))
+    information (2, 3, 3): of the logs, and of the variances themselves, as `learned` has it.
+    """
+
+    logs: Floats = field(default_factory=FIRST_LOGS.copy)
+    information: Floats = field(default_factory=lambda: nothing_learned(3))
 
     @property
     def variances(self) -> Floats:
@@ -65,9 +68,32 @@ class Shaking:
         W = S_inverse @ D
         slope = 0.5 * (D @ z @ z - np.trace(W, axis1=1, axis2=2))
         fisher = 0.5 * (W.reshape(3, -1) @ np.swapaxes(W, 1, 2).reshape(3, -1).T)
-        information = KEPT * self.information + fisher + (1.0 - KEPT) * 0.5 * FIRST * _IDENTITY
-        step = np.minimum(np.maximum(np.linalg.solve(information, slope), -LONGEST_STEP), LONGEST_STEP)
-        return Shaking(np.minimum(np.maximum(self.logs + step, LEAST), MOST), information)
+        logs, information = learned(self.logs, self.information, slope, fisher, FIRST_LOGS, KEPT)
+        return Shaking(np.minimum(np.maximum(logs, LEAST), MOST), information)
+
+
+def nothing_learned(count: int) -> Floats:
+    """Give the information (2, count, count) of variances of which only the first values are known."""
+    return np.tile(0.5 * FIRST * np.eye(count), (2, 1, 1))
+
+
+def learned(
+    logs: Floats, information: Floats, slope: Floats, fisher: Floats, first_logs: Floats, kept: float
+) -> tuple[Floats, Floats]:
+    """Go on by the likelihood's slope (n,) and its information (n, n), both by the logs (n,) of variances.
+
+    information (2, n, n): what has been learned of the logs, and of the variances as shares of the first ones; kept: so
+    much of it counts on. What a calm time tells of the logs is little, so that shaking which begins is believed at
+    once, but by the logs it would be believed for long after it has ended. By the variances it is the other way round.
+    The longer step is taken.
+    """
+    share = np.exp(logs - first_logs)
+    both = np.stack((fisher, fisher / np.outer(share, share)))
+    information = kept * information + both + (1.0 - kept) * nothing_learned(len(logs))
+    by_logs, by_shares = np.linalg.solve(information, np.stack((slope, slope / share))[..., None])[..., 0]
+    by_shares = np.log(np.maximum(1.0 + by_shares / share, math.exp(-LONGEST_STEP)))
+    step = np.where(np.abs(by_shares) > np.abs(by_logs), by_shares, by_logs)
+    return logs + np.minimum(np.maximum(step, -LONGEST_STEP), LONGEST_STEP), information
 
 
 def kept_share(span_s: float | Floats) -> Floats:
@@ -85,7 +111,7 @@ def shaking_noise(R: Floats, variances: Floats, span_s: float | Floats) -> Float
     """
     a, t, h = kept_share(span_s), SHAKEN_S, np.asarray(span_s)
     out = np.zeros((*R.shape[:-3], 3, MOVING, MOVING))
-    by_axis = variances[..., None, None] * _IDENTITY
+    by_axis = variances[..., None, None] * np.eye(3)
     fresh = (1.0 - a * a)[..., None, None]
     for node in (0, 1):
         of_node, q = out[..., node, :, :], by_axis[..., node, :, :] * fresh

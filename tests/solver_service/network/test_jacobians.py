@@ -188,7 +188,7 @@ def test_lights_of_one_picture_share_the_error_of_its_stamp_whosever_they_are(mo
     which = columns([bar.observer for bar in bars], [bar.other for bar in bars])
     y, H = rng.normal(0.0, 1.0, (3, 1, 2, 2)), rng.normal(0.0, 300.0, (3, 1, 2, 2, WIDTH + 1))
     applied: list[tuple[Floats, Floats]] = []
-    monkeypatch.setattr(NetEstimate, "_apply", lambda _, rows, __, noise, **___: applied.append((rows, noise)))
+    monkeypatch.setattr(NetEstimate, "_apply", lambda _, rows, __, noise, *___: applied.append((rows, noise)))
     estimate.lit_s[1, 2, 0] = -0.1
     estimate._update(bars, which, y, H, [(n, 0, n % 2, 0.5) for n in range(3)])
     [(rows, noise)] = applied

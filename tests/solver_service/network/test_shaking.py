@@ -24,9 +24,11 @@ def test_places_known_together_only_do_not_let_a_members_part_grow_without_an_en
         H[3 * k + 3 : 3 * k + 6, places[2 + k]] = np.eye(3)
     S_inverse = np.linalg.inv(H @ P @ H.T + 1e-6 * np.eye(len(H)))
     y = np.concatenate((np.full(3, 0.3), np.zeros(3 * others)))
+    gain = np.asarray(P @ H.T @ S_inverse, np.float64)
     for _ in range(100):
-        shaking = shaking.moved(still, drawn).taught(y, S_inverse, H, P)
+        adds = drawn * shaking.variances[:, :, None, None]
+        shaking = shaking.moved(still, adds).taught(y, S_inverse, H, gain)
     whole = np.array([P[at, at][0, 0] for at in (one, other)])
-    own = shaking.parts[:2, :, P_, P_].diagonal(axis1=2, axis2=3) * shaking.variances[:2, :, None]
+    own = shaking.parts[:2, :, P_, P_].diagonal(axis1=2, axis2=3)
     assert (own < 2.0 * whole[:, None, None]).all(), own
     assert np.isfinite(shaking.logs).all()
