@@ -19,7 +19,6 @@ from buddyline.solver_service.track.turning import Turning
 from buddyline.solver_service.track.units import clipped, fault_of
 
 CHECK_EVERY_S: Final = 2.0
-REJECTED_TO_SAY: Final = 10
 SILENT_S: Final = 1.0
 # A node that has told nothing for so long, and for GONE_PICTURES of its own, is gone. Nothing says how it turns then:
 # its lamps alone look the same whether it turns to the left or to the right.
@@ -155,10 +154,9 @@ class TrackIntake:
             elif len(samples) and not (len(samples.last(t_s + SILENT_S, 2.0 * SILENT_S)) or self.gone(node, t_s)):
                 name = self.nodes[node].name
                 self._problems.report(f"node {name}: inertial samples are missing: the track does without them", t_s)
-            if samples.rejected > self._rejected[node] + REJECTED_TO_SAY:
-                name = self.nodes[node].name
-                said = f"node {name}: inertial samples not finite, clipped or sent twice are left out"
-                self._problems.report(said, t_s)
+            if samples.rejected > self._rejected[node]:
+                which = f"node {self.nodes[node].name}: {samples.rejected} inertial samples so far are left out"
+                self._problems.report(f"{which}: not finite, clipped, sent twice or far from their neighbours", t_s)
                 self._rejected[node] = samples.rejected
 
     def _hear(self, node: int, t_s: float) -> None:

@@ -20,6 +20,7 @@ from buddyline.solver_service.track.inputs import (
     TrackNode,
 )
 from buddyline.solver_service.track.intake import TrackIntake
+from buddyline.solver_service.track.samples import false_ones, sound_ones
 from buddyline.solver_service.track.stepping import TrackSteps
 from buddyline.solver_service.track.vibration import fast_part, sudden_turn
 
@@ -123,9 +124,15 @@ def _end_ns(record: NodeRecord) -> int:
 
 def parted(record: NodeRecord) -> NodeRecord:
     """Give a record with the fast part of its inertial samples, and its camera's sudden turns."""
-    stamps_ns = record.imu_stamps_ns
-    of_each = [fast_part(stamps_ns, values) for values in (record.accel_mps2, record.gyro_radps)]
-    return replace(record, fast=np.column_stack((*of_each, sudden_turn(stamps_ns, record.gyro_radps))))
+    stamps_ns, values = record.imu_stamps_ns, np.hstack((record.accel_mps2, record.gyro_radps))
+    sound = sound_ones(values)
+    sound[sound] = ~false_ones(np.asarray(stamps_ns[sound], np.float64) * 1e-9, values[sound])
+    if sound.any() and not sound.all():
+        # One that is to be left out must not spoil those about it.
+        for column in values.T:
+            column[~sound] = np.interp(stamps_ns[~sound], stamps_ns[sound], column[sound])
+    of_each = [fast_part(stamps_ns, of_sensor) for of_sensor in (values[:, :3], values[:, 3:])]
+    return replace(record, fast=np.column_stack((*of_each, sudden_turn(stamps_ns, values[:, 3:]))))
 
 
 def last_ns(records: Records) -> int:

@@ -12,6 +12,10 @@ from numpy.typing import NDArray
 
 # Further apart, and what lies between two samples is not told.
 GAP_S: Final = 0.06
+# A sample further than this from both its neighbours, in any axis of force (m/s^2) or rate (rad/s), is false: a torn or
+# a wrong reading. Divers, shaken housings and noise stay below a tenth of it from one sample to the next at 100 Hz.
+FALSE_MPS2: Final = 5.0
+FALSE_RADPS: Final = 0.5
 # Over so long shaking has no mean to speak of, and motion changes little.
 SLOW_S: Final = 0.4
 _NOISE_SPAN_S: Final = 2.0
@@ -33,12 +37,44 @@ class SampleSteps:
     told: Bools
 
 
+def sound_ones(values: Floats) -> Bools:
+    """Tell which samples (N, 6) are numbers that a unit can give."""
+    return np.asarray(np.isfinite(values).all(1) & (np.abs(values) < 1e4).all(1))
+
+
+def false_ones(times_s: Floats, values: Floats) -> Bools:
+    """Tell which samples (N,), (N, 6), sound and in order of time, are false: jumps that later ones do not follow.
+
+    Nothing later is looked at than the sample itself. One that is near both false ones just before it, or comes more
+    than GAP_S after the last true one, is true. So is the first.
+    """
+    out, k = np.zeros(len(times_s), dtype=bool), 0
+    jumps = _apart(values[1:], values[:-1]) | (np.diff(times_s) <= 0.0)
+    for true in np.flatnonzero(jumps).tolist():
+        # Those before k have been judged already.
+        if true < k:
+            continue
+        k = true + 1
+        while k < len(out) and times_s[k] - times_s[true] < GAP_S and _apart(values[k], values[true]):
+            if k > true + 2 and not jumps[k - 2 : k].any():
+                break
+            out[k] = True
+            k += 1
+    return out
+
+
+def _apart(one: Floats, other: Floats) -> Bools:
+    """Whether samples (..., 6) are further from each other than neighbours are."""
+    off = np.abs(one - other)
+    return np.asarray((off[..., :3].max(-1) > FALSE_MPS2) | (off[..., 3:].max(-1) > FALSE_RADPS))
+
+
 class Samples:
     """Inertial samples in camera axes, by stamp in s since an epoch.
 
-    `rejected` counts samples that were not finite, or came twice. `trusted`: whether they are to be used. `parted`:
-    whether the fast part of any is known. `shares` (2,): how much of the fast part of force and rate is the unit's
-    alone, and is taken off (vibration.py).
+    `rejected` counts samples that were not finite, false, or came twice. `trusted`: whether they are to be used.
+    `parted`: whether the fast part of any is known. `shares` (2,): how much of the fast part of force and rate is the
+    unit's alone, and is taken off (vibration.py).
     """
 
     def __init__(self) -> None:
@@ -48,6 +84,8 @@ class Samples:
         self.parted = False
         self.shares = np.zeros(2)
         self._count = 0
+        # The false ones since the last that is not.
+        self._false = np.zeros(0), np.zeros((0, 6))
         self._noise_s = -np.inf
         self._noise = Noise(GYRO_FLOOR, ACCEL_FLOOR)
         self.rejected = 0
@@ -71,7 +109,7 @@ class Samples:
 
         fast (N, 7): their fast part and the camera's sudden turn, where they are known.
         """
-        sound = np.isfinite(times_s) & np.isfinite(values).all(1) & (np.abs(values) < 1e4).all(1)
+        sound = np.isfinite(times_s) & sound_ones(values)
         self.rejected += int(len(sound) - sound.sum())
         self.parted |= fast is not None
         values = np.hstack((values, np.zeros((len(values), 7)) if fast is None else fast))
@@ -84,7 +122,13 @@ class Samples:
             every, first = np.unique(merged, return_index=True)
             self.rejected += len(merged) - len(every)
             values = np.concatenate((self._values[: self._count], values))[first]
-            times_s, self._count = every, 0
+            # Those that were there have been judged.
+            false = false_ones(every, values[:, :6]) & (first >= self._count)
+            times_s, self._count, self._false = every, 0, (np.zeros(0), np.zeros((0, 6)))
+        else:
+            false = self._judged(times_s, values[:, :6])
+        self.rejected += int(false.sum())
+        times_s, values = times_s[~false], values[~false]
         need = self._count + len(times_s)
         if need > len(self._t):
             room = max(2 * len(self._t), need)
@@ -93,6 +137,16 @@ class Samples:
         self._t[self._count : need] = times_s
         self._values[self._count : need] = values
         self._count = need
+
+    def _judged(self, times_s: Floats, values: Floats) -> Bools:
+        """Tell which of these samples (N,), (N, 6), which come after all others, are false."""
+        one = slice(max(self._count - 1, 0), self._count)
+        times_s = np.concatenate((self._t[one], self._false[0], times_s))
+        values = np.concatenate((self._values[one, :6], self._false[1], values))
+        false, count = false_ones(times_s, values), len(self._t[one]) + len(self._false[0])
+        last = 1 + int(np.flatnonzero(~false)[-1])
+        self._false = times_s[last:], values[last:]
+        return false[count:]
 
     def forget_before(self, time_s: float) -> None:
         """Drop samples older than time_s, but for the last one."""

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from buddyline.solver_service.geometry.rotation import rotation_exp
 from buddyline.solver_service.track.inputs import Attitudes, AttitudeSeen
-from buddyline.solver_service.track.records import between
+from buddyline.solver_service.track.records import NodeRecord, between, parted
+
+from tests.solver_service.track.dives import Setting, make
 
 
 def seen(stamp_ns: int) -> AttitudeSeen:
@@ -38,3 +42,19 @@ def test_attitudes_of_one_stamp_stay_in_the_order_that_they_came_in() -> None:
     first, second = (AttitudeSeen(10, np.eye(3), np.full(3, sigma)) for sigma in (0.1, 0.2))
     for pieces in ([[first, second], [seen(5)]], [[first], [second], [seen(5)]]):
         assert [one.sigma_rad[0] for one in Attitudes.joined(pieces)][1:] == [0.1, 0.2]
+
+
+def test_what_is_left_out_does_not_spoil_the_fast_part_of_samples_about_it() -> None:
+    rng = np.random.default_rng(3)
+    stamps_ns = 10_000_000 * np.arange(600)
+    shaken = 0.3 * np.sin(2.0 * np.pi * 4.0 * stamps_ns * 1e-9)[:, None] + rng.normal(0.0, 0.01, (600, 3))
+    node = make(1, Setting(seconds=0.5)).records[0].node
+    record = NodeRecord(node, (), stamps_ns, np.array((0.0, 0.0, -9.8)) + shaken, 0.1 * shaken)
+    harmed = replace(record, accel_mps2=record.accel_mps2.copy(), gyro_radps=record.gyro_radps.copy())
+    harmed.accel_mps2[200], harmed.accel_mps2[300, 1], harmed.gyro_radps[400] = 60.0, np.nan, 9.0
+    one, other = parted(record).fast, parted(harmed).fast
+    assert one is not None
+    assert other is not None
+    sound = np.delete(np.arange(600), (200, 300, 400))
+    assert np.abs(one[sound, :3]).max() > 0.2
+    np.testing.assert_allclose(other[sound, :6], one[sound, :6], atol=0.02)

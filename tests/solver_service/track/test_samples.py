@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from buddyline.solver_service.track.samples import Samples
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.track.samples import Samples, false_ones
 
 TIMES_S = np.array((1.0, 1.01, 1.02, 1.03))
 
@@ -26,3 +27,80 @@ def test_the_samples_between_are_points_of_the_grid() -> None:
     assert grid.tolist() == [1.005, 1.01, 1.02, 1.03]
     assert at[:, 0] == pytest.approx(grid)
     assert told.all()
+
+
+def swum(count: int = 400) -> tuple[Floats, Floats]:
+    """Return samples (N,), (N, 6) of a unit at 100 Hz that swims, with their noise."""
+    rng = np.random.default_rng(5)
+    t: Floats = 0.01 * np.arange(count, dtype=np.float64)
+    force = np.array((0.0, 0.0, -9.8)) + 0.5 * np.sin(3.0 * t)[:, None] + rng.normal(0.0, 0.1, (count, 3))
+    rate = 0.8 * np.sin(2.0 * t)[:, None] + rng.normal(0.0, 0.01, (count, 3))
+    return t, np.asarray(np.hstack((force, rate)), np.float64)
+
+
+FALSE = [7, 90, 91, 92, 250, 399]
+
+
+def spoiled() -> tuple[Floats, Floats]:
+    """Return samples of which those of FALSE are false, each in its own way."""
+    t, values = swum()
+    values[7, 3:], values[90], values[91:93], values[250, 4] = 9.0, 0.0, -30.0, 4.36
+    values[399, :3] = 60.0, -60.0, 60.0
+    return t, values
+
+
+@pytest.mark.parametrize("at_once", [1, 3, 400])
+def test_a_false_sample_is_left_out_and_counted(at_once: int) -> None:
+    """One message holds one sample, or some, and says nothing of the next."""
+    t, values = spoiled()
+    samples = Samples()
+    for first in range(0, len(t), at_once):
+        samples.add(t[first : first + at_once], values[first : first + at_once])
+    np.testing.assert_array_equal(samples.times_s, np.delete(t, FALSE))
+    np.testing.assert_array_equal(samples.values, np.delete(values, FALSE, axis=0))
+    assert samples.rejected == len(FALSE)
+
+
+def test_a_false_sample_that_comes_late_is_left_out() -> None:
+    t, values = spoiled()
+    samples = Samples()
+    order = np.r_[0:80, 85:100, 80:85, 100:399]
+    order[92:95] = order[92:95][::-1]
+    for k in order.tolist():
+        samples.add(t[k : k + 1], values[k : k + 1])
+    np.testing.assert_array_equal(samples.times_s, np.delete(t[:399], FALSE[:-1]))
+    assert samples.rejected == len(FALSE) - 1
+
+
+@pytest.mark.parametrize("at_once", [1, 400])
+def test_what_lasts_is_true_after_two_samples(at_once: int) -> None:
+    """A housing that is struck, a unit that has been turned over while its log had a gap."""
+    t, values = swum()
+    values[200:] += 7.0
+    t = np.concatenate((t[:300], t[300:] + 0.2))
+    values[300:, :3] -= 30.0
+    samples = Samples()
+    for first in range(0, len(t), at_once):
+        samples.add(t[first : first + at_once], values[first : first + at_once])
+    np.testing.assert_array_equal(samples.times_s, np.delete(t, (200, 201)))
+
+
+def test_a_false_sample_that_is_sent_twice_is_false() -> None:
+    t, values = spoiled()
+    samples = Samples()
+    for k in range(len(t)):
+        samples.add(t[[k]], values[[k]])
+        samples.add(t[[k]], values[[k]])
+    np.testing.assert_array_equal(samples.times_s, np.delete(t, FALSE))
+    assert samples.rejected == len(t) + len(FALSE)
+
+
+def test_motion_and_noise_are_not_false() -> None:
+    """A head turned by half a radian within 0.6 s, blows of fins, and noise ten times that of a cheap unit."""
+    t, values = swum(1000)
+    rng = np.random.default_rng(6)
+    values[:, :3] += rng.normal(0.0, 0.3, (1000, 3))
+    values[:, 3:] += rng.normal(0.0, 0.04, (1000, 3))
+    values[500:560, 3:] += 1.6 * np.sin(np.linspace(0.0, np.pi, 60))[:, None]
+    values[600:620, :3] += 8.0 * np.sin(np.linspace(0.0, np.pi, 20))[:, None]
+    assert not false_ones(t, values).any()

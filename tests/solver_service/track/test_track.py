@@ -305,7 +305,7 @@ def test_a_track_that_began_wrong_is_replaced(dive: KnownDive) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("harm", ["nan", "doubled", "gap", "stops", "no attitude", "no depth"])
+@pytest.mark.parametrize("harm", ["nan", "false", "doubled", "gap", "stops", "no attitude", "no depth"])
 def test_bad_input_costs_little(dive: KnownDive, harm: str) -> None:
     a, b = dive.records
     stamps, accel, gyro = b.imu_stamps_ns.copy(), b.accel_mps2.copy(), b.gyro_radps.copy()
@@ -313,6 +313,8 @@ def test_bad_input_costs_little(dive: KnownDive, harm: str) -> None:
     if harm == "nan":
         accel[::7, 1] = np.nan
         gyro[::11] = np.inf
+    elif harm == "false":
+        accel[::90], gyro[50::90, 1], gyro[70::90] = 0.0, 8.7, np.random.default_rng(1).uniform(-9.0, 9.0, 3)
     elif harm == "doubled":
         stamps[1::50] = stamps[:-1:50][: len(stamps[1::50])]
     elif harm == "gap":
@@ -332,6 +334,8 @@ def test_bad_input_costs_little(dive: KnownDive, harm: str) -> None:
     judged = score(dive, smooth((a, b), dive.fixes, dive.stamps_ns).rows)
     assert judged.covered >= 0.95
     assert judged.wrong == 0
+    if harm in ("false", "doubled"):
+        assert judged.nees < 1.3
 
 
 @pytest.mark.slow
