@@ -10,6 +10,7 @@ import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log
 from buddyline.solver_service.track.lights import COLUMNS
 from buddyline.solver_service.track.output import TrackRow, rows_of
+from buddyline.solver_service.track.scale import with_gap
 from buddyline.solver_service.track.shaking import SHAKEN_S
 from buddyline.solver_service.track.smoother import Path
 from buddyline.solver_service.track.state import NAV, PHI, R_, V_, State, invariant_of_plain, plain_of_invariant
@@ -17,21 +18,29 @@ from numpy.typing import NDArray
 
 # So many rows are made at once.
 TOGETHER: Final = 256
+NO_GAP: Final[Floats] = np.zeros(len(COLUMNS))
 
 
-def rows_between(path: Path, times_s: Floats, stamps_ns: Sequence[int]) -> Iterator[TrackRow]:
-    """Yield the smoothed steps' rows at times (N,) within them."""
+def rows_between(
+    path: Path, times_s: Floats, stamps_ns: Sequence[int], gap: float = 0.0, by_gap: Floats = NO_GAP
+) -> Iterator[TrackRow]:
+    """Yield the smoothed steps' rows at times (N,) within them.
+
+    gap: between both bars, by_gap (C,): how one of 1 moves the rows' errors; as of `scale.with_gap`.
+    """
     if len(path) < 2:
         return
     within = np.flatnonzero((times_s >= path.t_s[0] - 1e-3) & (times_s <= path.t_s[-1] + 1e-3))
     for start in range(0, len(within), TOGETHER):
         some = within[start : start + TOGETHER]
         with np.errstate(all="ignore"):
-            rows = _rows_together(path, times_s[some], [stamps_ns[i] for i in some.tolist()])
+            rows = _rows_together(path, times_s[some], [stamps_ns[i] for i in some.tolist()], gap, by_gap)
         yield from (row for row in rows if row is not None)
 
 
-def _rows_together(path: Path, times_s: Floats, stamps_ns: Sequence[int]) -> list[TrackRow | None]:
+def _rows_together(
+    path: Path, times_s: Floats, stamps_ns: Sequence[int], gap: float, by_gap: Floats
+) -> list[TrackRow | None]:
     one = np.clip(np.searchsorted(path.t_s, times_s, side="right") - 1, 0, len(path) - 2)
     two = one + 1
     span_s = np.maximum(path.t_s[two] - path.t_s[one], 1e-6)
@@ -48,6 +57,8 @@ def _rows_together(path: Path, times_s: Floats, stamps_ns: Sequence[int]) -> lis
         P = across + np.swapaxes(across, 1, 2)
         for J, k in ((by_one, one), (by_two, two)):
             P += J @ path.covariance(k) @ np.swapaxes(J, 1, 2)
+    if gap:
+        P = with_gap(P, gap, by_gap, between)
     near = np.where(share < 1.0, one, two)
     return rows_of(
         stamps_ns,

@@ -43,6 +43,7 @@ from buddyline.solver_service.track.records import (
     until_one_ended,
 )
 from buddyline.solver_service.track.relax import PassedOver, PathPass
+from buddyline.solver_service.track.scale import ScaleGap, said, scaled
 from buddyline.solver_service.track.settling import clock_sigma_s, settled
 from buddyline.solver_service.track.smoother import Path, smoothed
 from buddyline.solver_service.track.start import CLOCK_S
@@ -66,6 +67,9 @@ CLOCK_TRIES_S: Final = (0.4, -0.4, 0.8, -0.8)
 HEAD_NS: Final = 90 * S_NS
 # Further off, there is no track where a node has no inertial unit: the offset that is found is itself off by a tenth.
 FAR_WITHOUT_S: Final = 0.05
+# First passes over a dive whose bars do not fit each other, the last included; a gap of so many sigmas may be left.
+GAP_ROUNDS: Final = 5
+GAP_LEFT_SIGMAS: Final = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,9 +94,42 @@ def smooth(
 
     clock_ns: how far B's clock is believed ahead. again: whether to begin once more where the later passes contradict
     the first one: with the offset that they found, which is nearer than that of the first.
+
+    Where the pictures of both nodes tell different distances, their bars are taken for longer and shorter by half of
+    that each, and the sigmas hold that one of them alone may be wrong.
     """
     a, b = until_one_ended((in_order(records[0]), in_order(records[1])), clock_ns)
-    records, fixes = (parted(a), parted(b)), sorted(fixes, key=stamp_of)
+    records, fixes, gap = (parted(a), parted(b)), sorted(fixes, key=stamp_of), 0.0
+    for left in reversed(range(GAP_ROUNDS)):
+        found = _of_bars(records, fixes, outputs_ns, clock_ns, gap, again=again, closes=left > 0)
+        if isinstance(found, Smoothed):
+            break
+        gap += found
+        shares = -0.5 * found, 0.5 * found
+        a, b = (
+            replace(record, node=replace(record.node, rig=scaled(record.node.rig, share)))
+            for record, share in zip(records, shares, strict=True)
+        )
+        records = a, b
+    assert isinstance(found, Smoothed)
+    names = [record.node.name for record in records]
+    return replace(found, problems=[*found.problems, said(gap, names)]) if gap else found
+
+
+def _of_bars(
+    records: Records,
+    fixes: Sequence[FixSeen],
+    outputs_ns: Sequence[int],
+    clock_ns: int,
+    gap: float,
+    *,
+    again: bool,
+    closes: bool,
+) -> Smoothed | float:
+    """Give the track with the bars as they are in the records, or by how much more these do not fit each other.
+
+    gap: what they have been changed by. closes: whether a further gap is to be given.
+    """
     told_ns = clock_ns
     long = bool(fixes) and fixes[-1].stamp_ns - fixes[0].stamp_ns > 2 * HEAD_NS
     head_ns = (fixes[0].stamp_ns + HEAD_NS) // PIECE_NS * PIECE_NS if long else END_NS
@@ -104,6 +141,9 @@ def smooth(
         left_ns = clock_left_ns(parts)
         if left_ns:
             first, parts, clock_ns = _rounds(records, fixes, clock_ns + left_ns)
+    between_bars = reduce(ScaleGap.plus, [part.scale for part in parts], ScaleGap())
+    if closes and (between_bars.found or (gap and between_bars.sigmas > GAP_LEFT_SIGMAS)):
+        return between_bars.share
     if not parts:
         return Smoothed([], clock_ns * 1e-9, math.inf, first.problems)
     parts = of_one_clock(parts)
@@ -119,11 +159,11 @@ def smooth(
         del first, parts
         only = _empty_filter(records, told_ns, CLOCK_WITHOUT_S)
         pass_over(only, records, fixes)
-        return replace(_of_guessed_motion(records, only, fixes, outputs_ns), clock_sigma_s=math.inf)
+        return replace(_of_guessed_motion(records, only, fixes, outputs_ns, gap), clock_sigma_s=math.inf)
     shares = reduce(Shares.plus, [part.shares for part in parts]).best()
     known = PassedOver(records, first.epoch_ns or 0, clock_ns, shares, Walking())
     if all(part.lone for part in parts):
-        return _of_one_lamp_each(known, max(parts, key=lasted_s), outputs_ns)
+        return _of_one_lamp_each(known, max(parts, key=lasted_s), outputs_ns, gap)
     # Beside a track of any other start these are not linear enough for the passes below.
     parts = [part for part in parts if not part.lone]
     learned = replace(known, walking=joint([part.walking for part in parts]), unrest=_unrest(parts))
@@ -153,11 +193,12 @@ def smooth(
             span = f"no track for {lasted_s(part):.0f} s"
             lost.append(f"{first.both}: passes over the dive contradict the first one or do not settle: {span}")
     if not found and again and contradicting_ns is not None:
-        other = smooth(records, fixes, outputs_ns, contradicting_ns, again=False)
+        other = _of_bars(records, fixes, outputs_ns, contradicting_ns, gap, again=False, closes=False)
+        assert isinstance(other, Smoothed)
         return other if math.isfinite(other.clock_sigma_s) else replace(other, problems=[*other.problems, *lost])
     if not found:
         return Smoothed([], clock_ns * 1e-9, math.inf, [*first.problems, *lost])
-    whole = _rows_of(found, outputs_ns)
+    whole = _rows_of(found, outputs_ns, gap)
     return replace(whole, problems=[*whole.problems, *lost])
 
 
@@ -182,7 +223,7 @@ def _clock_s(track: TrackFilter | PathPass, path: Path) -> float:
     return track.clock_ns * 1e-9 + path.state(-1).clock_s
 
 
-def _of_one_lamp_each(known: PassedOver, part: Estimate, outputs_ns: Sequence[int]) -> Smoothed:
+def _of_one_lamp_each(known: PassedOver, part: Estimate, outputs_ns: Sequence[int], gap: float) -> Smoothed:
     """Give the track that began with one lamp of each node, the dive's beginning with it if that settles, too."""
     path, told, shaking = smoothed(part.steps, uses_up=True), sum(part.told_by), part.shaking.less(known.shares)
     # A reflection beside the lit lamp would pass for the dark one, and tell a range.
@@ -196,7 +237,7 @@ def _of_one_lamp_each(known: PassedOver, part: Estimate, outputs_ns: Sequence[in
     earlier = _path_before(known, path, -math.inf)
     if earlier is not None:
         track, path = settled(path.after(earlier), track.passed.detection, shaking, known, told, doubtful=True) or found
-    return _rows_of([(track, path)], outputs_ns)
+    return _rows_of([(track, path)], outputs_ns, gap)
 
 
 def _path_before(known: PassedOver, path: Path, since_s: float) -> Path | None:
@@ -258,7 +299,7 @@ def _empty_filter(records: Records, clock_ns: int, clock_sigma_s: float) -> Trac
 
 
 def _of_guessed_motion(
-    records: Records, first: TrackFilter, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
+    records: Records, first: TrackFilter, fixes: Sequence[FixSeen], outputs_ns: Sequence[int], gap: float
 ) -> Smoothed:
     """Give the tracks of a first pass over nodes without inertial units.
 
@@ -282,17 +323,17 @@ def _of_guessed_motion(
         found.append(again or (first, path))
     if not found:
         return Smoothed([], first.clock_ns * 1e-9, math.inf, first.problems)
-    whole = _rows_of(found, outputs_ns)
+    whole = _rows_of(found, outputs_ns, gap)
     problems = list(dict.fromkeys([*first.problems, *whole.problems]))
     return replace(whole, problems=problems, dark=first.lamps.dark())
 
 
-def _rows_of(passed: Sequence[tuple[TrackFilter | PathPass, Path]], outputs_ns: Sequence[int]) -> Smoothed:
+def _rows_of(passed: Sequence[tuple[TrackFilter | PathPass, Path]], outputs_ns: Sequence[int], gap: float) -> Smoothed:
     """Give the rows of last passes' paths."""
     problems = list(dict.fromkeys(said for track, _ in passed for said in track.problems))
     stamps = sorted(outputs_ns)
     rows = chain.from_iterable(
-        rows_between(path, np.array([track.between(stamp) for stamp in stamps]), stamps) for track, path in passed
+        rows_between(path, np.array([track.between(stamp) for stamp in stamps]), stamps, gap) for track, path in passed
     )
     last, path = passed[-1]
     return Smoothed(rows, _clock_s(last, path), clock_sigma_s(path), problems, last.lamps.dark())

@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_log
+from buddyline.solver_service.track.scale import ScaleGap
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.state import MOVING, SIZE, State
 from buddyline.solver_service.track.trail import Chosen, Trail
@@ -31,6 +32,7 @@ class Estimate:
     place was poorly known at the last picture. without: which nodes have no inertial unit now. turning_off: of each,
     the lasting part (3,) of what its attitudes are off their prediction, in sigmas. by_shares (SIZE, 4): how the state
     would be moved by a share of 1 of the samples' fast parts; shares: what the lights tell of them (vibration.py).
+    by_scale (SIZE,), scale: the same of a gap between both bars (scale.py).
     attitude_s, depth_s: when attitudes and depths were last used.
 
     The lights: detection (2, 2): by observer and light, how often a light in the picture is found; shown (2, 2): how
@@ -99,6 +101,8 @@ class Estimate:
     without: list[bool] = field(default_factory=lambda: [False, False])
     by_shares: Floats = field(default_factory=lambda: np.zeros((SIZE, SHARES)))
     shares: Shares = field(default_factory=Shares)
+    by_scale: Floats = field(default_factory=lambda: np.zeros(SIZE))
+    scale: ScaleGap = field(default_factory=ScaleGap)
     turning_off: list[Floats] = field(default_factory=lambda: [np.zeros(3), np.zeros(3)])
     agreed_s: float = np.inf
     agreed: int = 0

@@ -19,6 +19,7 @@ from buddyline.solver_service.track.lights import BLOCK, COLUMNS, Sight
 from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S, excerpt
 from buddyline.solver_service.track.output import CONTRADICTS, TrackRow, fix_chi2, fix_residual
 from buddyline.solver_service.track.pool import MAX_TENTATIVE, TrackPool
+from buddyline.solver_service.track.scale import MOST_GAP, said, with_gap
 from buddyline.solver_service.track.seeing import ONE_TRIGGER_S
 from buddyline.solver_service.track.start import CLOCK_S, state_from_fix
 from buddyline.solver_service.track.state import CLOCK, SIZE, State, place_covariance
@@ -150,6 +151,8 @@ class TrackFilter(TrackPool):
 
     def _present(self, estimate: Estimate, t_s: float) -> Forecast:
         state, from_s, P = estimate.state, estimate.t_s, estimate.covariance
+        if estimate.scale.found:
+            P = with_gap(P, estimate.scale.share, estimate.by_scale, state)
         if t_s <= from_s:
             return of_state(from_s, state, P, estimate.rates_radps)
         a, b = (
@@ -166,7 +169,8 @@ class TrackFilter(TrackPool):
     def doubted(self) -> bool:
         """Whether a live track is not to be told; `problems` says why.
 
-        Its clocks prove further apart than it bears, or did lately, or the last fixes contradict it: its first updates
+        Both bars contradict each other by more than MOST_GAP. Its clocks prove further apart than it bears, or did
+        lately, or the last fixes contradict it: its first updates
         were then far from linear. Or no fix has agreed with it, and few pictures have shown both lights. A track that
         starts anew believes in its clocks anew.
         """
@@ -180,6 +184,9 @@ class TrackFilter(TrackPool):
         # With a dark lamp there may be no fix but another's for minutes.
         lately = main.t_s - self._fix_s < APART_S
         contradicted = lately and main.contradicted >= max(FIXES_TO_DOUBT, SHARE_TO_DOUBT * main.agreed)
+        unequal = main.confirmed and main.scale.found
+        if unequal:
+            self._problems.report(said(main.scale.share, [node.name for node in self.nodes]), main.t_s)
         if apart:
             self._problems.report(f"{self.both}: their clocks are far apart: no live track", main.t_s)
         if contradicted and main.contradicted >= FIXES_TO_SAY:
@@ -187,7 +194,7 @@ class TrackFilter(TrackPool):
         founded = not main.searched or main.agreed > 0 or self._followed(main)
         if main.confirmed and not founded:
             self._problems.report(f"{self.both}: no pose, and few pictures with both lamps: no live track", main.t_s)
-        return apart or contradicted or not founded
+        return apart or contradicted or not founded or (unequal and abs(main.scale.share) > MOST_GAP)
 
     @staticmethod
     def _followed(main: Estimate) -> bool:

@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 from buddyline.solver_service.track.between import rows_between
 from buddyline.solver_service.track.filter import TrackFilter
+from buddyline.solver_service.track.lights import COLUMNS
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.smoother import smoothed
 
@@ -48,6 +49,7 @@ class TrackLag:
         self._done_s = ready_s
         self._due = self._due[len(ready) :]
         times_s = np.array([self._track.between(stamp) for stamp in ready])
-        rows = list(rows_between(smoothed(main.steps), times_s, ready))
+        gap = main.scale.share if main.scale.found else 0.0
+        rows = list(rows_between(smoothed(main.steps), times_s, ready, gap, main.by_scale[COLUMNS]))
         main.steps.drop_before(ready_s - EVERY_S)
         return rows

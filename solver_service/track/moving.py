@@ -204,6 +204,8 @@ class TrackMoves(TrackIntake):
             by_shares = estimate.by_shares.copy()
             by_shares[:MOVING] = F @ estimate.by_shares + moved_by_shares(after, parts.by_fast)
             estimate.by_shares = by_shares
+        if estimate.learns:
+            estimate.by_scale = np.concatenate((F @ estimate.by_scale, estimate.by_scale[MOVING:]))
         without_a, without_b = parts.without.tolist()
         if self._follows_walk(estimate):
             guessed, moved = self._guessed(estimate, after, F, parts, (a, b), noises, span_s, shares)

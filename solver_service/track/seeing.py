@@ -25,6 +25,7 @@ from buddyline.solver_service.track.lights import (
     with_stamp,
 )
 from buddyline.solver_service.track.moving import KNOWN_CLOCK_S, TrackMoves
+from buddyline.solver_service.track.scale import by_scale
 from buddyline.solver_service.track.smoother import Path
 from buddyline.solver_service.track.state import (
     CLOCK,
@@ -251,7 +252,10 @@ class TrackSights(TrackMoves):
         rows_H, rows_y, noise = light_rows(found.chosen, y, H)
         more = counted_more(found.chosen, used)
         doubts = doubted(found.chosen, sight) if estimate.confirmed else np.zeros(len(rows_y))
-        error, chi2 = told_by(estimate, rows_H, rows_y, noise, more, doubts)
+        k, light, _ = map(list, zip(*found.chosen, strict=True))
+        other = 1 - sight.node
+        stretched = by_scale(H[k, light], estimate.state, other, self.nodes[other].rig.lights_m[light])
+        error, chi2 = told_by(estimate, rows_H, rows_y, noise, more, doubts, stretched)
         estimate.state = estimate.state.plus(error)
         estimate.lasted += 2 * sum(float(sight.lasting_s[k]) > 0.0 for k, *_ in found.chosen)
         note_lit(estimate, sight, used)
@@ -274,14 +278,15 @@ def told_by(
     noise: Floats,
     more: Floats | None = None,
     doubts: Floats | None = None,
+    stretched: Floats | None = None,
     *,
     others: int = 0,
 ) -> tuple[Floats, float]:
     """Update all but an estimate's state; give the error (SIZE,) to add to that, and chi^2 of the residuals y (m,).
 
     more (m,): by how much variances count more than they are, in all but chi^2. doubts (m,): of lights, which teach
-    shaking and shares: what their variances have for doubts that shaking does not share. others: how many rows, the
-    first ones, are not of lights.
+    shaking and shares: what their variances have for doubts that shaking does not share. stretched (m,): of lights, h
+    as `scale.by_scale` gives it. others: how many rows, the first ones, are not of lights.
     """
     before = estimate.covariance
     if more is None or not more.any():
@@ -294,6 +299,12 @@ def told_by(
         if doubts is not None:
             estimate.shares = estimate.shares.taught(y, S_inverse, moved)
         estimate.by_shares = estimate.by_shares - gain @ moved
+    if estimate.learns:
+        moved = H @ estimate.by_scale
+        if stretched is not None:
+            moved = moved + stretched
+            estimate.scale = estimate.scale.taught(y, S_inverse, moved)
+        estimate.by_scale = estimate.by_scale - gain @ moved
     if estimate.follows_walk:
         learns = before[CLOCK, CLOCK] < KNOWN_CLOCK_S**2 and not (estimate.wide and any(estimate.without))
         estimate.walking = estimate.walking.taught(y, S_inverse, H, gain, learns=learns)
