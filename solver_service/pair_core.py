@@ -186,15 +186,26 @@ class PairCore:
         )
 
     def report(
-        self, stamp_ns: int, now_ns: int, problems: list[str], bad_messages: int, unused: list[str]
+        self,
+        stamp_ns: int,
+        now_ns: int,
+        problems: list[str],
+        bad_messages: int,
+        unused: list[str],
+        *,
+        over: bool = False,
     ) -> SolverStatus:
-        """Return the pair's status at stamp_ns. now_ns: steady receive time. problems: known from outside the pair."""
+        """Return the pair's status at stamp_ns. now_ns: steady receive time. problems: known from outside the pair.
+
+        over: of a whole dive, whose status also names the track's problems that ended before the dive did.
+        """
         (node_a, node_b), (stream_a, stream_b) = self.nodes, self.streams
         latencies_s = sorted(self.latencies_s)
         self.latencies_s.clear()
         p99 = len(latencies_s) * 99 // 100
         offset = self._estimate_offset(now_ns)
         self._advised = self.advice()
+        of_track = self.tracker.problems if self.tracker is not None else []
         return SolverStatus(
             node_a=node_a,
             node_b=node_b,
@@ -212,9 +223,7 @@ class PairCore:
             latency_median_s=statistics.median(latencies_s) if latencies_s else UNSET,
             latency_p99_s=latencies_s[p99] if latencies_s else UNSET,
             clock_skew_s=UNSET if offset is None else offset.offset_s,
-            problem="; ".join(
-                problems + self._disagreements(offset) + present(self.tracker.problems if self.tracker else [])
-            ),
+            problem="; ".join(problems + self._disagreements(offset) + (of_track if over else present(of_track))),
             unused=unused or UNSET,
             advice=self._advised or UNSET,
             late_imu=(self.tracker.late_imu if self.tracker else 0) or UNSET,

@@ -38,7 +38,7 @@ from buddyline.solver_service.track.lag import EVERY_S, KEPT_S, TrackLag
 from buddyline.solver_service.track.lamps import UNSEEN_PICTURES, UNSEEN_S
 from buddyline.solver_service.track.moving import HOLD_S
 from buddyline.solver_service.track.output import TrackRow
-from buddyline.solver_service.track.problems import ENDED_S, as_ended
+from buddyline.solver_service.track.problems import ENDED_S, as_ended, present
 from buddyline.solver_service.track.records import NodeRecord, Records, feed, joined
 from buddyline.solver_service.track_messages import (
     attitudes_of,
@@ -114,6 +114,7 @@ class PairTracker:
         # Inertial samples that came too late, and each node's newest trigger when its last one did.
         self.late_imu = 0
         self._late_ns: dict[str, int] = {}
+        self._made = False
         self._streams = stream_a, stream_b
         self._settings = settings
         self._period_ns = round(S_NS / settings.rate_hz)
@@ -309,7 +310,23 @@ class PairTracker:
         """
         # Later rows would only be guessed. The filter holds back what is within HOLD_S of the end.
         heard_ns = max(stream.heard_ns for stream in self._streams) + round(2.0 * HOLD_S * S_NS)
-        return self._end(min(self._settled_ns + S_NS, heard_ns))
+        posed = self._posed
+        told = self._end(min(self._settled_ns + S_NS, heard_ns))
+        if not (self._made or self._stopped or present(self.problems)):
+            self._note([self._why_none(posed=posed)])
+        return told
+
+    def _why_none(self, *, posed: bool) -> str:
+        """Say why a dive has no track, where nothing is wrong with its messages. posed: whether it has a pose."""
+        a, b = self._streams
+        if posed and a.attitude.newest_ns is None and a.imu.newest_ns is None:
+            return f"no track: node {a.node} told neither attitudes nor inertial samples, so a pose starts none"
+        if posed:
+            return "no track: the lights after each pose do not agree with a start from it"
+        without = [stream.node for stream in (a, b) if stream.attitude.newest_ns is None]
+        if without:
+            return f"no track: no pose starts one, nor do lights without attitudes of {' and '.join(without)}"
+        return "no track: no pose starts one, and lights with both attitudes fit no start"
 
     def _end(self, end_ns: int) -> Iterable[Message]:
         """Take what is left up to end_ns, and tell what the end of a track tells."""
@@ -331,6 +348,8 @@ class PairTracker:
             self._note(self._dark_lamps(found.dark))
         told = math.isfinite(found.clock_sigma_s)
         self._clock = (found.clock_offset_s, found.clock_sigma_s) if told else None
+        # Rows are made as they are read; where there is no track they are an empty list.
+        self._made |= found.rows != []
         return chain(messages, self._messages(found.rows, "smooth"))
 
     def _make_filter(self, nodes: tuple[TrackNode, TrackNode]) -> None:
@@ -400,6 +419,7 @@ class PairTracker:
         tracks = [
             track_message(row, node_a, node_b, mode, oriented=coming.oriented) for row, mode in made if row is not None
         ]
+        self._made |= bool(tracks)
         return [*coming.messages, *tracks, *self._expected(coming)]
 
     def _expected(self, coming: Coming) -> list[Message]:

@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
             for pair in core.pairs.values():
                 # What the whole dive told: counts, the clocks' offset, problems. There is no diver left to advise.
                 problems = core.health.of_dive(pair.nodes)
-                status = pair.report(dive.end_ns, dive.end_ns, problems, bad, sorted(core.unused))
+                status = pair.report(dive.end_ns, dive.end_ns, problems, bad, sorted(core.unused), over=True)
                 writer.write_message(replace(status, advice=UNSET), dive.end_ns)
     _summarize(args, core, tracks, bad, time.monotonic() - began_s)
     if not core.counts.total():
@@ -358,7 +358,8 @@ def _track_figures(pair: PairCore, tracks: Mapping[tuple[str, ...], Tracked]) ->
 def _track_text(mode: str, pair: PairCore, tracks: Mapping[tuple[str, ...], Tracked]) -> str:
     told = tracks.get(pair.nodes, Tracked())
     if pair.tracker is None or not told.rows:
-        return f"  no track ({mode}): it starts from a pose, or from lights and both attitudes"
+        why = pair.tracker.problems if pair.tracker is not None else []
+        return f"  no track ({mode}): {'; '.join(one.removeprefix('no track: ') for one in why) or 'no row is due'}"
     clock = pair.tracker.clock_now()
     clocks = "" if clock is None else f"; {_clock_words(pair.nodes, *clock)}"
     return f"  track ({mode}): {told}{clocks}"

@@ -1,6 +1,7 @@
 """The track as messages: the same in any order of arrival, honest against truth, none where nothing is known."""
 
 import random
+import re
 from itertools import groupby
 
 import numpy as np
@@ -196,6 +197,43 @@ def test_without_a_pose_there_is_no_track():
     messages, _ = dive_messages(seconds=3.0, imu=True)
     blind = [replace(m, blobs=[]) if isinstance(m, Candidates) else m for m in messages]
     assert tracks_of(blind, "filter", "lag", "smooth")[0] == []
+
+
+@pytest.mark.parametrize("mode", ["smooth", "filter"])
+@pytest.mark.parametrize(
+    ("seen", "told", "said"),
+    [
+        ("ab", "b", "no track: node a told neither attitudes nor inertial samples, so a pose starts none"),
+        ("", "a", "no track: no pose starts one, nor do lights without attitudes of b"),
+        ("", "ab", "no track: no pose starts one, and lights with both attitudes fit no start"),
+    ],
+)
+def test_a_dive_without_a_track_says_why(mode, seen, told, said):
+    """seen: the nodes whose candidates have blobs; told: those with attitudes."""
+    messages = [
+        replace(one, blobs=[]) if isinstance(one, Candidates) and one.node not in seen else one
+        for one in dive_messages(seconds=3.0)[0]
+        if one.node in told or isinstance(one, Candidates | NodeInfo)
+    ]
+    tracks, solver = tracks_of(messages, mode)
+    assert tracks == []
+    assert (solver.counts["solved"] > 0) == (seen == "ab")
+    pair = solver.pairs["a", "b"]
+    assert pair.tracker.problems == [said]
+    assert pair.report(0, 0, [], 0, [], over=True).problem.endswith(said)
+
+
+def test_the_status_of_a_whole_dive_names_problems_that_ended_before_it_did(inertial_dive):
+    start_ns = inertial_dive[0][0].stamp_ns
+    in_g = [
+        replace(one, accel_mps2=tuple(x / 9.80665 for x in one.accel_mps2))
+        if isinstance(one, Imu) and one.node == "b" and one.stamp_ns < start_ns + 4 * S_NS
+        else one
+        for one in inertial_dive[0]
+    ]
+    pair = tracks_of(in_g, "filter")[1].pairs["a", "b"]
+    assert re.search(r"g in place of m/s\^2; not used \(ended\)", pair.report(0, 0, [], 0, [], over=True).problem)
+    assert "g in place" not in pair.report(0, 0, [], 0, []).problem
 
 
 @pytest.mark.parametrize("crowded", [False, True])

@@ -11,6 +11,7 @@ from typing import get_args
 
 import pytest
 from buddyline.protocol.divelog import DiveLogWriter
+from buddyline.protocol.messages import Candidates, NodeInfo
 from buddyline.solver_service.choices import METHODS
 from buddyline.solver_service.geometry.observation import Method
 from buddyline.tools.cli import COMMANDS, main
@@ -88,6 +89,16 @@ def test_solve_says_what_its_track_covers(capsys, dive_log, tmp_path):
     assert re.search(r"track \(smooth\): \d+ rows over \d\.\d s, longest time without a light", out)
     _, out, _ = run(capsys, "solve", dive_log, "-o", tmp_path / "none.mcap", "--track", "none")
     assert "track (" not in out
+
+
+def test_solve_says_why_there_is_no_track_of_poses(capsys, tmp_path):
+    with DiveLogWriter(tmp_path / "dive.mcap") as writer:
+        for message in dive_messages(seconds=3.0)[0]:
+            if isinstance(message, Candidates | NodeInfo):
+                writer.write_message(message)
+    _, out, _ = run(capsys, "solve", tmp_path / "dive.mcap", "-o", tmp_path / "out.mcap")
+    assert int(re.search(r"(\d+) poses of", out)[1]) > 10
+    assert "  no track (smooth): node a told neither attitudes nor inertial samples, so a pose starts none\n" in out
 
 
 def test_a_track_in_parts_says_for_how_long_it_tells():

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from buddyline.protocol.messages import Message, SolverStatus
+from buddyline.protocol.messages import Candidates, Message, NodeInfo, SolverStatus
 from buddyline.tools.cli import main
 from buddyline.tools.dives import Dive
 from buddyline.tools.monitor.summary import summarize
 from msgspec import UNSET
 from msgspec.structs import replace
 
+from tests.solver_service.conftest import dive_messages
 from tests.tools import recompute_report
 from tests.tools.evaluated import INFOS, frame, pose, rejection, track, truth, write_log
 from tests.tools.recompute_report import differences, numbers_in, recompute
@@ -168,6 +169,18 @@ def test_without_a_track_no_outlier_is_judged(tmp_path: Path) -> None:
     page = (tmp_path / "r.html").read_text("utf-8")
     assert numbers_in(page)["outliers"] is None
     assert "Not judged: the log holds no track" in page
+
+
+def test_a_missing_track_and_the_solver_s_problems_are_named(tmp_path: Path) -> None:
+    """Without attitudes and inertial samples of a the poses start no track."""
+    messages = [one for one in dive_messages(seconds=3.0)[0] if isinstance(one, Candidates | NodeInfo)]
+    log, output = write_log(tmp_path / "raw.mcap", *messages), str(tmp_path / "solved.mcap")
+    assert main(["solve", log, "-o", output]) == 0
+    assert main(["report", output, "-o", str(tmp_path / "r.html")]) == 0
+    page = unescape((tmp_path / "r.html").read_text("utf-8"))
+    assert numbers_in(page)["poses"]
+    assert "this log holds no track of this pair" in page
+    assert re.search(r"the solver's last status: .*no track: node a told neither attitudes nor inertial samples", page)
 
 
 def test_a_solved_dive_has_its_status_for_the_report(tmp_path: Path) -> None:

@@ -87,6 +87,11 @@ def report_html(
     warnings = [*dive.losses, *authenticity]
     if not summary.poses:
         warnings.append("this log holds no pose; solve it first: buddyline solve DIVE.mcap -o OUT.mcap")
+    elif not summary.tracks:
+        warnings.append("this log holds no track of this pair")
+    solver = summary.picture.solver
+    if solver is not None and solver.problem:
+        warnings.append(f"the solver's last status: {solver.problem}")
     missing = numbers["triggers"]["without_outcome"]
     if missing and missing < numbers["triggers"]["total"]:
         warnings.append(
