@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from buddyline.node.choices import DETECTORS, PRESETS
-from buddyline.protocol.options import above_zero
+from buddyline.protocol.options import above_zero, finite
 from buddyline.protocol.security import PLAYER, ROS
 from buddyline.solver_service.choices import CHECKS, METHODS, TRACKS
 from buddyline.tools.client import add_client_arguments
@@ -71,11 +71,11 @@ def _detector(parser: argparse.ArgumentParser) -> None:
 def play(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `play`."""
     _dives(parser)
-    parser.add_argument("--speed", type=float, default=1.0, help="times real time; 0: as fast as possible; default: 1")
+    parser.add_argument("--speed", type=finite, default=1.0, help="times real time; 0: as fast as possible; default: 1")
     parser.add_argument(
-        "--start", type=float, default=0.0, metavar="S", help="begin so many seconds after the dive's start"
+        "--start", type=finite, default=0.0, metavar="S", help="begin so many seconds after the dive's start"
     )
-    parser.add_argument("--end", type=float, metavar="S", help="end so many seconds after the dive's start")
+    parser.add_argument("--end", type=finite, metavar="S", help="end so many seconds after the dive's start")
     parser.add_argument("--loop", action="store_true", help="repeat the dive; the times continue")
     add_client_arguments(parser, PLAYER)
 
@@ -198,7 +198,7 @@ def solve(parser: argparse.ArgumentParser) -> None:
     clocks = parser.add_mutually_exclusive_group()
     clocks.add_argument(
         "--clock-offset",
-        type=float,
+        type=finite,
         metavar="S",
         help="B's clock minus A's, from `buddyline align`; default: what the nodes' beacons tell; 0: none",
     )
@@ -218,7 +218,7 @@ def solve(parser: argparse.ArgumentParser) -> None:
         "before (filter), or none; default: %(default)s",
     )
     parser.add_argument(
-        "--track-hz", type=float, default=50.0, metavar="HZ", help="rows a second; default: %(default)s"
+        "--track-hz", type=finite, default=50.0, metavar="HZ", help="rows a second; default: %(default)s"
     )
     _detector(parser)
     _json(parser, "print the summary as JSON")
@@ -301,9 +301,9 @@ def plan(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `plan`."""
     shown = "default: %(default)s"
     parser.add_argument(
-        "--baseline", type=float, default=0.88, metavar="M", help=f"distance between a node's lights; {shown}"
+        "--baseline", type=finite, default=0.88, metavar="M", help=f"distance between a node's lights; {shown}"
     )
-    parser.add_argument("--visibility", type=float, metavar="M", help="how far a diver sees; default: no limit")
+    parser.add_argument("--visibility", type=finite, metavar="M", help="how far a diver sees; default: no limit")
     parser.add_argument(
         "--camera",
         metavar="FILE",
@@ -311,17 +311,17 @@ def plan(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--sigma-px",
-        type=float,
+        type=finite,
         metavar="PX",
         help="1 sd of a light's place in a picture; default: the camera's, or 0.7",
     )
     parser.add_argument(
-        "--compass-deg", type=float, default=2.0, metavar="DEG", help=f"error of the compasses; {shown}"
+        "--compass-deg", type=finite, default=2.0, metavar="DEG", help=f"error of the compasses; {shown}"
     )
     tolerance = parser.add_argument_group("tolerances, RMS")
-    tolerance.add_argument("--range-tolerance", type=float, default=0.10, metavar="M", help=shown)
-    tolerance.add_argument("--position-tolerance", type=float, default=0.10, metavar="M", help=shown)
-    tolerance.add_argument("--azimuth-tolerance", type=float, default=3.0, metavar="DEG", help=shown)
+    tolerance.add_argument("--range-tolerance", type=finite, default=0.10, metavar="M", help=shown)
+    tolerance.add_argument("--position-tolerance", type=finite, default=0.10, metavar="M", help=shown)
+    tolerance.add_argument("--azimuth-tolerance", type=finite, default=3.0, metavar="DEG", help=shown)
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw it; needs the extra `plots`")
     _json(parser, "print one JSON object: metres, radians")
 

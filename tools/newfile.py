@@ -25,9 +25,11 @@ REMOVE_IT: Final = "name another or remove it first"
 
 def check_new(path: Path | str, hint: str = REMOVE_IT) -> Path:
     """Return the path; raise BuddylineError if a file is there. Call it before the work whose result goes there."""
+    # An empty name is this folder.
+    path = Path(path)
     if os.path.lexists(path):
         raise BuddylineError(f"{path}: exists; {hint}")
-    return Path(path)
+    return path
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from buddyline.node.sim.scenario import (
     more_nodes,
 )
 from buddyline.protocol.clock import MS_NS, S_NS
+from buddyline.protocol.options import finite
 from buddyline.tools.progress import Progress
 
 START_NS = 1_764_000_000 * S_NS
@@ -37,7 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     def number(to: argparse._ActionsContainer, option: str, field: str, metavar: str, text: str = "") -> None:
         default = getattr(scenario if hasattr(scenario, field) else plan, field)
         help_text = f"{text}default: %(default)s"
-        to.add_argument(option, dest=field, type=type(default), default=default, metavar=metavar, help=help_text)
+        kind = finite if isinstance(default, float) else int
+        to.add_argument(option, dest=field, type=kind, default=default, metavar=metavar, help=help_text)
 
     parser.add_argument("output", metavar="OUT.mcap", help="the dive log to write; must not exist")
     choice(parser, "environment", ENVIRONMENTS, "the waters; ")
@@ -75,12 +77,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     number(faults, "--misses", "miss_share", "SHARE", "lights not found; ")
     number(faults, "--false", "false_lights", "N", "false candidates in each picture; ")
     number(faults, "--lost", "lost_share", "SHARE", "frames lost; ")
-    faults.add_argument("--clock-offset-ms", type=float, default=0.0, metavar="MS", help="b's clock ahead of a's")
+    faults.add_argument("--clock-offset-ms", type=finite, default=0.0, metavar="MS", help="b's clock ahead of a's")
     faults.add_argument(
-        "--clock-drift-ppm", type=float, default=0.0, metavar="PPM", help="how fast b's clock gains on a's"
+        "--clock-drift-ppm", type=finite, default=0.0, metavar="PPM", help="how fast b's clock gains on a's"
     )
     faults.add_argument(
-        "--magnetometer-off-deg", type=float, default=0.0, metavar="DEG", help="b's heading is wrong by this"
+        "--magnetometer-off-deg", type=finite, default=0.0, metavar="DEG", help="b's heading is wrong by this"
     )
     faults.add_argument(
         "--dead-lamp", action="append", default=[], metavar="NODE.SIDE", help="a dark lamp, such as b.left; repeatable"
@@ -95,7 +97,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     number(faults, "--pwm-hz", "pwm_hz", "HZ", "the lights are dimmed by pulses; 0: not dimmed; ")
     number(faults, "--strobe-s", "strobe_s", "S", "time between a strobe's flashes; 0: no strobe; ")
     faults.add_argument(
-        "--row-time-us", type=float, default=0.0, metavar="US", help="rolling shutter: time from row to row; 0: none"
+        "--row-time-us", type=finite, default=0.0, metavar="US", help="rolling shutter: time from row to row; 0: none"
     )
 
 

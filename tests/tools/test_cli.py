@@ -11,6 +11,7 @@ from typing import get_args
 
 import pytest
 from buddyline.protocol.divelog import DiveLogWriter
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Candidates, NodeInfo
 from buddyline.solver_service.choices import METHODS
 from buddyline.solver_service.geometry.observation import Method
@@ -284,6 +285,58 @@ def test_a_number_that_must_be_above_zero_is_named(words, capsys):
         main([*words])
     assert ended.value.code == 2
     assert f"{words[-1]}: give a number above 0" in capsys.readouterr().err
+
+
+def numeric_options():
+    """Yield the words before each number that a command or subcommand takes, and what argparse makes of it."""
+
+    def of(parser, words):
+        for action in parser._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                for name, below in action.choices.items():
+                    yield from of(below, [*words, name])
+            elif callable(action.type):
+                yield " ".join([*words, *action.option_strings[-1:]]), action.type
+
+    for command in COMMANDS:
+        yield from of(command.parser(), [command.name])
+
+
+@pytest.mark.parametrize("text", ["nan", "inf", "-inf", "1e300"])
+def test_no_option_takes_a_number_that_is_none(text):
+    """Each would end in a traceback, or in a file full of it."""
+
+    def takes(kind):
+        try:
+            return isinstance(kind(text), float)
+        except (ValueError, argparse.ArgumentTypeError, BuddylineError):
+            return False
+
+    checked = dict(numeric_options())
+    assert {"solve --clock-offset", "play --start", "view --start", "calibrate lights --tape"} <= checked.keys()
+    assert [words for words, kind in checked.items() if takes(kind)] == []
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("solve", "dive.mcap", "-o", "out.mcap", "--clock-offset", "nan"),
+        ("simulate", "dive.mcap", "--clock-drift-ppm", "inf"),
+        ("view", "dive.mcap", "--start", "1e300"),
+    ],
+)
+def test_a_number_that_is_none_is_named(words, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main([*words])
+    assert ended.value.code == 2
+    assert f"argument {words[-2]}: {words[-1]}: give a number from -4e9 to 4e9" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("output", [".", ""])
+@pytest.mark.parametrize("form", ["foxglove", "csv"])
+def test_a_folder_is_no_name_for_an_export(form, output, dive_log, capsys):
+    assert main(["export", str(dive_log), "--format", form, "-o", output]) == 2
+    assert capsys.readouterr().err == "buddyline export: .: exists; name another or remove it first\n"
 
 
 @pytest.mark.parametrize("command", ["solver", "node", "hub"])

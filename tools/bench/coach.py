@@ -31,6 +31,7 @@ from buddyline.node.sim.trajectory import PairMotion
 from buddyline.node.sim.world import World
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.health import NO_POSE_S
+from buddyline.protocol.options import finite
 from buddyline.tools.bench.steering import (
     RAMP_S,
     SEEN_SHARE,
@@ -82,7 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dives", type=int, default=20, help="of each case; default: 20")
     parser.add_argument("--no-imu", action="store_true", help="nodes have attitude and depth, no inertial samples")
     parser.add_argument("--seed", type=int, default=1, help="default: 1")
-    parser.add_argument("--turn", type=float, default=TURN_DEGPS, metavar="DEG", help="a second; default: %(default)g")
+    parser.add_argument("--turn", type=finite, default=TURN_DEGPS, metavar="DEG", help="a second; default: %(default)g")
 
 
 def asked_for(words: list[str]) -> Vector:

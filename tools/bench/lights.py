@@ -37,6 +37,7 @@ from buddyline.node.pipeline import Pipeline
 from buddyline.protocol.clock import S_NS, trigger_index
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Blob, Expect, ExpectedLight
+from buddyline.protocol.options import finite
 from buddyline.tools.evaluation.lights import tolerance_px
 from buddyline.tools.measure.pictures import simulated_world
 from buddyline.tools.measure.tables import cells_of, text_table
@@ -116,7 +117,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--environment", nargs="+", choices=ENVIRONMENTS, default=list(ENVIRONMENTS), metavar="WATER")
     parser.add_argument("--seed", type=int, default=FIRST_SEED, help=f"of the first scene; default: {FIRST_SEED}")
     parser.add_argument("--scenes", type=int, default=3, metavar="N", help="in each water; default: 3")
-    parser.add_argument("--seconds", type=float, default=24.0, help="of each scene; default: 24")
+    parser.add_argument("--seconds", type=finite, default=24.0, help="of each scene; default: 24")
     parser.add_argument("--strange", type=int, default=1, metavar="N", help="other divers' lamps; default: 1")
     parser.add_argument("--guided", action="store_true", help="with the other node's lights expected")
     parser.add_argument("--scene", action="store_true", help="with the scene's exposure instead of the lamps'")

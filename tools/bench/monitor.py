@@ -28,6 +28,7 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.envelope import Envelope, Refusals
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Candidates, CompressedImage, FoxgloveTime, RelativePose
+from buddyline.protocol.options import finite
 from buddyline.protocol.topics import CANDIDATES, IMAGE, POSE
 from buddyline.tools.client import ClientConfig
 from buddyline.tools.extras import needed
@@ -52,10 +53,10 @@ CHROMIUM_FLAGS: Final = ("--no-sandbox", "--use-angle=swiftshader", "--enable-un
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the benchmark's arguments."""
-    parser.add_argument("--minutes", type=float, default=2.0, help="when CPU and memory are read again; default: 2")
+    parser.add_argument("--minutes", type=finite, default=2.0, help="when CPU and memory are read again; default: 2")
     parser.add_argument("--viewers", type=int, nargs="+", default=[1, 3], metavar="N", help="default: 1 3")
     parser.add_argument("--rounds", type=int, default=4, help="of latency with and without; default: 4")
-    parser.add_argument("--round-s", type=float, default=15.0, help="default: 15")
+    parser.add_argument("--round-s", type=finite, default=15.0, help="default: 15")
 
 
 def measure(args: argparse.Namespace) -> dict[str, Any]:

@@ -37,6 +37,7 @@ from buddyline.node.service import NodeService
 from buddyline.protocol.clock import S_NS, Clock
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Candidates, Message, NodeInfo
+from buddyline.protocol.options import finite
 from buddyline.tools.bench.prepared_bus import PreparedBus
 from buddyline.tools.measure.children import Child, free_endpoint
 from buddyline.tools.measure.load import load_of, thread_times_s
@@ -52,10 +53,10 @@ CONNECT_S: Final = 20.0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the benchmark's arguments."""
     parser.add_argument("--environment", default="cavern")
-    parser.add_argument("--seconds", type=float, default=60.0, metavar="S", help="default: 60, after 5 to warm up")
-    parser.add_argument("--rate", type=float, default=10.0, metavar="HZ", help="default: 10")
+    parser.add_argument("--seconds", type=finite, default=60.0, metavar="S", help="default: 60, after 5 to warm up")
+    parser.add_argument("--rate", type=finite, default=10.0, metavar="HZ", help="default: 10")
     parser.add_argument("--width", type=int, default=1640, metavar="PX", help="default: 1640, by 1232")
-    parser.add_argument("--images", type=float, default=2.0, metavar="HZ", help="recorded pictures; default: 2")
+    parser.add_argument("--images", type=finite, default=2.0, metavar="HZ", help="recorded pictures; default: 2")
 
 
 def measure(args: argparse.Namespace) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol import topics
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.options import above_zero
+from buddyline.protocol.options import above_zero, finite
 from buddyline.protocol.topics import check_node_id
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.live import LiveClient, follow_running
@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--boat", metavar="HOST:PORT", help="it hangs under a boat, whose GGA or RMC sentences come here by UDP"
     )
     place.add_argument(
-        "--declination", type=float, metavar="DEG", help="where headings are magnetic: true north, east positive; "
+        "--declination", type=finite, metavar="DEG", help="where headings are magnetic: true north, east positive; "
         "default: by the World Magnetic Model at --place, if pygeomag is installed"
     )  # fmt: skip
     out = parser.add_argument_group("to whom (one at least)")
@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "needed), GPS_INPUT (with --place or --boat); default: odometry",
     )
     out.add_argument("--system", type=int, default=1, metavar="ID", help="the vehicle's MAVLink system; default: 1")
-    out.add_argument("--rate", type=float, default=DEFAULT_RATE_HZ, metavar="HZ", help="at most; default: %(default)s")
+    out.add_argument("--rate", type=finite, default=DEFAULT_RATE_HZ, metavar="HZ", help="at most; default: %(default)s")
     out.add_argument(
         "--set-origin",
         action="store_true",

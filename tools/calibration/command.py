@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.options import above_zero
+from buddyline.protocol.options import above_zero, finite
 from buddyline.tools.arguments import subcommand
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.newfile import check_new, write_new
@@ -36,7 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         if runs in (_board, _camera):
             kind.add_argument("--columns", type=int, default=9, help="squares across; default 9")
             kind.add_argument("--rows", type=int, default=6, help="squares up; default 6")
-            kind.add_argument("--square-mm", type=float, default=30.0, help="side of a square, as measured; default 30")
+            kind.add_argument(
+                "--square-mm", type=finite, default=30.0, help="side of a square, as measured; default 30"
+            )
         if runs in (_camera, _lights, _magnetometer):
             kind.add_argument(
                 "--picture",
@@ -75,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     lights.add_argument(
         "--tape",
         nargs=3,
-        type=float,
+        type=finite,
         action="append",
         required=True,
         metavar=("BEGIN_S", "END_S", "METRES"),
@@ -84,13 +86,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     lights.add_argument("--nodes", nargs=2, metavar=("A", "B"), help="which pair, of a dive of several")
     lights.add_argument(
-        "--pixel-sigma", type=float, default=0.5, metavar="PX", help="1 sd of a light's mean place; default: 0.5"
+        "--pixel-sigma", type=finite, default=0.5, metavar="PX", help="1 sd of a light's mean place; default: 0.5"
     )
     lights.add_argument(
-        "--tape-sigma-mm", type=float, default=5.0, metavar="MM", help="1 sd of a taped distance; default: 5"
+        "--tape-sigma-mm", type=finite, default=5.0, metavar="MM", help="1 sd of a taped distance; default: 5"
     )
     lights.add_argument(
-        "--ruler-sigma-mm", type=float, default=10.0, metavar="MM", help="1 sd of the configured places; default: 10"
+        "--ruler-sigma-mm", type=finite, default=10.0, metavar="MM", help="1 sd of the configured places; default: 10"
     )
     lights.add_argument(
         "--new-info",
@@ -107,7 +109,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     magnetometer.add_argument("dives", nargs="+", metavar="DIVE.mcap", help="a log with the node's inertial samples")
     magnetometer.add_argument("--node", help="whose samples, of a log of several nodes")
     magnetometer.add_argument(
-        "--position", nargs=2, type=float, metavar=("LAT", "LON"), help="where it was taken: sets the field's strength"
+        "--position", nargs=2, type=finite, metavar=("LAT", "LON"), help="where it was taken: sets the field's strength"
     )
 
     gyroscope = add(

@@ -76,6 +76,8 @@ def run(args: argparse.Namespace) -> int:
         raise BuddylineError("--node: only with --what net")
     if form.module and args.output is None:
         raise BuddylineError(f"--format {form.name}: give -o FILE")
+    if args.output is not None:
+        check_new(args.output)
     if form.module and not form.table:
         return _export_file(args, form)
     of_pair = {
@@ -87,8 +89,6 @@ def run(args: argparse.Namespace) -> int:
     if of_net and any(of_pair.values()):
         given = ", ".join(name for name, is_given in of_pair.items() if is_given)
         raise BuddylineError(f"{given}: not with all nodes of a net")
-    if args.output is not None:
-        check_new(args.output)
     if form.table:
         what = _write_table(args, form)
     else:

@@ -9,6 +9,7 @@ import threading
 from typing import TYPE_CHECKING, Any, Final
 
 from buddyline.protocol.clock import S_NS
+from buddyline.protocol.options import finite
 from buddyline.tools.monitor.live import add_page_arguments, open_page
 from buddyline.tools.pairs import add_pair_argument, solved_pair
 
@@ -28,7 +29,7 @@ MAX_STEP_NS: Final = 3 * S_NS // 10
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("dives", nargs="+", metavar="DIVE.mcap", help="one dive: a solved log, or each node's own")
-    parser.add_argument("--start", type=float, default=0.0, metavar="S", help="seconds from the dive's start")
+    parser.add_argument("--start", type=finite, default=0.0, metavar="S", help="seconds from the dive's start")
     parser.add_argument("--paused", action="store_true", help="do not start to play at once")
     add_pair_argument(parser, "the first in the logs")
     add_page_arguments(parser)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from buddyline.protocol.clock import SystemClock
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Mark
-from buddyline.protocol.options import above_zero
+from buddyline.protocol.options import above_zero, finite
 from buddyline.protocol.security import SURVEYOR
 from buddyline.protocol.topics import MARK, check_node_id
 from buddyline.tools.client import add_client_arguments, client_config
@@ -38,7 +38,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seconds", type=above_zero, metavar="S", help="give up after this long without a hub; default: wait for it"
     )
     parser.add_argument(
-        "--linger", type=float, default=1.0, metavar="S", help="stay connected for this long after the mark; default: 1"
+        "--linger",
+        type=finite,
+        default=1.0,
+        metavar="S",
+        help="stay connected for this long after the mark; default: 1",
     )
 
 
