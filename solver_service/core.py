@@ -32,6 +32,7 @@ from buddyline.solver_service.networking import NetTracker
 from buddyline.solver_service.pace import Pace
 from buddyline.solver_service.pair_core import PairCore, PairId, newer
 from buddyline.solver_service.resting import CROWD
+from buddyline.solver_service.results import wrong_size
 from buddyline.solver_service.sensors import KEPT_NS
 from buddyline.solver_service.streams import Arrival, NodeStream
 from buddyline.solver_service.track.problems import present
@@ -313,6 +314,8 @@ class SolverCore:
                 self.network.forget()
             if now_ns is not None:
                 self.health.saw_frame(stream.node, message.stamp_ns, now_ns)
+            calibration = stream.calibration(message.stamp_ns)
+            self.health.saw_size(stream.node, wrong_size(message, calibration[0]) if calibration is not None else "")
             seen_ns = message.stamp_ns if now_ns is None else now_ns
             self.health.saw_run(message, seen_ns, is_second=arrival is Arrival.CONFLICT)
             for pair in self._pairs_of.get(stream.node, ()):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
@@ -47,6 +48,9 @@ class Health:
         self._releases: dict[str, str] = {}
         self._runs: dict[str, Runs] = {}
         self._blinks: dict[str, Blink] = {}
+        # By node, how its pictures' size differs from its calibration's: of the newest picture, and of the last such.
+        self._size: dict[str, str] = {}
+        self._sizes: dict[str, str] = {}
 
     def saw_frame(self, node: str, stamp_ns: int, now_ns: int) -> None:
         """Note a frame of a node."""
@@ -91,6 +95,12 @@ class Health:
         else:
             self._releases[node] = release
 
+    def saw_size(self, node: str, wrong: str) -> None:
+        """Note how a picture's size differs from its calibration's, "" where it does not."""
+        self._size[node] = wrong
+        if wrong:
+            self._sizes[node] = wrong
+
     def saw_process(self, name: str, alive: bool) -> bool:
         """Note that a process has started or ended; name: as declared alive on the bus. Return whether that is news."""
         node = name.removeprefix("node/")
@@ -116,14 +126,19 @@ class Health:
                     "do their clocks agree?"
                 )
         twins = [_twins_text(node) for node in nodes if self._twins(node, now_ns)]
-        return found + others + twins + self._one_code(nodes)
+        sizes = [_size_text(node, wrong) for node in nodes if (wrong := self._size.get(node, ""))]
+        return found + others + twins + sizes + self._one_code(nodes)
 
     def of_dive(self, nodes: tuple[str, str]) -> list[str]:
-        """Return what a dive that is over told of a pair of nodes: two have one id, one code, or another release."""
+        """Return what a dive that is over told of a pair of nodes: one id, one code, another release, wrong sizes."""
         twins = [node for node in nodes if (runs := self._runs.get(node)) is not None and runs.twins]
         own, releases = self._other_releases(nodes)
         others = [f"node {node} ran Buddyline {its}, this is {own}" for node, its in releases]
-        return [*map(_twins_text, twins), *self._one_code(nodes), *others]
+        return [*map(_twins_text, twins), *self._one_code(nodes), *others, *self.sizes_of_dive(nodes)]
+
+    def sizes_of_dive(self, nodes: Iterable[str]) -> list[str]:
+        """Return which nodes had pictures of another size than their calibration."""
+        return [_size_text(node, self._sizes[node]) for node in nodes if node in self._sizes]
 
     def _other_releases(self, nodes: tuple[str, str]) -> tuple[str | None, list[tuple[str, str]]]:
         """Return the release of this program, and which nodes run another."""
@@ -159,6 +174,10 @@ class Health:
 
 def _twins_text(node: str) -> str:
     return f"two nodes have the id {node}: give each its own"
+
+
+def _size_text(node: str, wrong: str) -> str:
+    return f"pictures of node {node} are {wrong}: they are not used"
 
 
 def _alike(one: Blink, other: Blink) -> bool:

@@ -15,7 +15,7 @@ from typing import Final
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Candidates, Reason
 from buddyline.solver_service.pair import Matched
-from buddyline.solver_service.results import sensed_of
+from buddyline.solver_service.results import sensed_of, wrong_size
 from buddyline.solver_service.streams import FAR_NS, Arrival, NodeStream, size_bytes
 
 # A missing frame is given up when the node's frames have advanced this far beyond it, in the dive's own time.
@@ -224,8 +224,7 @@ class PairMatcher:
             return None
         self.matched += 1
         for one, (info, _) in ((frame_a, known_a), (frame_b, known_b)):
-            if (one.width_px, one.height_px) != (info.width_px, info.height_px):
-                sizes = f"{one.width_px}x{one.height_px} px, its calibration {info.width_px}x{info.height_px}"
+            if sizes := wrong_size(one, info):
                 return self._give_up(one, "no_info", f"frame of {one.node} is {sizes}")
         self._finish(waiting.trigger, 0)
         self._newest_resolved = max(self._newest_resolved, waiting.trigger)

@@ -17,7 +17,7 @@ from buddyline.solver_service.network.belief import KnownPlace
 from buddyline.solver_service.network.filter import NetFilter
 from buddyline.solver_service.network.rows import NetRow
 from buddyline.solver_service.pace import NO_NETWORK
-from buddyline.solver_service.results import NUMERIC_ERRORS, view_of
+from buddyline.solver_service.results import NUMERIC_ERRORS, view_of, wrong_size
 from buddyline.solver_service.streams import STOPPED_NS, NodeStream
 from buddyline.solver_service.track.inputs import DepthSeen
 from buddyline.solver_service.track.problems import as_ended
@@ -223,7 +223,8 @@ class NetTracker:
             track.add_attitude(index, attitude)
         for depth in stream.depth.between(start_ns, end_ns):
             track.add_depth(index, DepthSeen(depth.stamp_ns, depth.depth_m, depth.sigma_m))
-        frames = [one for one in stream.frames.between(start_ns, end_ns) if not one.trigger % self.one_in]
+        info, between = self._infos[stream.node], stream.frames.between(start_ns, end_ns)
+        frames = [one for one in between if not (one.trigger % self.one_in or wrong_size(one, info))]
         track.add_frames(index, [frame_of(view_of(frame)) for frame in frames])
 
     def _message(self, row: NetRow) -> NodePose:

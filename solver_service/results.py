@@ -70,6 +70,13 @@ def _cut_px(blob: Blob, frame: Candidates) -> float:
     return max(math.sqrt(blob.area_px / math.pi) - min(blob.u_px, blob.v_px, right_px, below_px), 0.0)
 
 
+def wrong_size(frame: Candidates, info: NodeInfo) -> str:
+    """Return the sizes of a frame and of its calibration's pictures where they differ, else ""."""
+    if (frame.width_px, frame.height_px) == (info.width_px, info.height_px):
+        return ""
+    return f"{frame.width_px}x{frame.height_px} px, its calibration {info.width_px}x{info.height_px}"
+
+
 def sensed_of(attitude: SampleStream[Attitude], depth: SampleStream[Depth], stamp_ns: int) -> Sensed:
     """Return a node's attitude and depth at stamp_ns; each is None if unknown."""
     oriented = attitude_at(attitude, stamp_ns)

@@ -25,7 +25,7 @@ from buddyline.protocol.messages import (
 )
 from buddyline.solver_service.pace import NO_TRACK
 from buddyline.solver_service.resting import LOOK_APART, LOOKS, REST_NS
-from buddyline.solver_service.results import NUMERIC_ERRORS, view_of
+from buddyline.solver_service.results import NUMERIC_ERRORS, view_of, wrong_size
 from buddyline.solver_service.sensors import KEPT_NS
 from buddyline.solver_service.streams import NodeStream
 from buddyline.solver_service.track.clocks import Clocks, clock_now, clocks_of
@@ -446,7 +446,7 @@ class PairTracker:
         return [k * self._period_ns for k in rows if not k % self.one_in]
 
     def _piece(self, stream: NodeStream, node: int, start_ns: int, end_ns: int) -> NodeRecord:
-        if self._nodes is None:
+        if self._nodes is None or self._infos is None:
             raise RuntimeError("no calibration yet")
         stamps_ns, values = stream.imu.between(start_ns, end_ns)
         first, own = self._nodes[0].rig, self._nodes[node].rig
@@ -456,7 +456,9 @@ class PairTracker:
             frames=[
                 frame_of(view_of(frame))
                 for frame in stream.frames.between(start_ns, end_ns)
-                if frame.trigger not in self._unseen and not frame.trigger % self.one_in
+                if frame.trigger not in self._unseen
+                and not frame.trigger % self.one_in
+                and not wrong_size(frame, self._infos[node])
             ],
             imu_stamps_ns=stamps_ns,
             accel_mps2=values[:, :3],

@@ -277,7 +277,9 @@ def _write(writer: DiveLogWriter, results: Iterable[Message], tracks: dict[tuple
 def _summarize(
     args: argparse.Namespace, core: SolverCore, tracks: Mapping[tuple[str, ...], Tracked], bad: int, took_s: float
 ) -> None:
-    for problem in dict.fromkeys(one for pair in core.pairs for one in core.health.of_dive(pair)):
+    of_pairs = [one for pair in core.pairs for one in core.health.of_dive(pair)]
+    # Nodes of lamps alone, or of a camera alone, are in no pair.
+    for problem in dict.fromkeys([*of_pairs, *core.health.sizes_of_dive(sorted(core.streams))]):
         log.warning("%s", problem)
     for problem in core.network.problems if core.network is not None else ():
         log.warning("network: %s", problem)

@@ -108,6 +108,21 @@ def test_two_nodes_of_one_id_and_one_boot_are_named(other_seq, later_s):
     assert TWINS_OF_B in core.health.problems(AB, 105 * S_NS)
 
 
+def test_a_node_with_pictures_of_another_size_than_its_calibration_is_named_while_they_come():
+    messages, _ = dive_messages(seconds=2.0, sensors=False)
+    core = SolverCore(Settings(), [AB])
+    for one in messages:
+        early = isinstance(one, Candidates) and one.node == "b" and one.stamp_ns < messages[0].stamp_ns + S_NS
+        core.handle(replace(one, width_px=1640, height_px=1232) if early else one, one.stamp_ns)
+        if early:
+            said = core.health.problems(AB, one.stamp_ns)
+    expected = "pictures of node b are 1640x1232 px, its calibration 820x616: they are not used"
+    assert said == [expected]
+    assert core.health.problems(AB, messages[-1].stamp_ns) == []
+    # A dive that is over is judged as a whole.
+    assert core.health.of_dive(AB) == [expected]
+
+
 def test_nodes_that_blink_by_one_code_are_named(health):
     blink = Blink(code=3, lamp="left", slot_ns=S_NS // 10)
     health.saw_blink("a", blink)

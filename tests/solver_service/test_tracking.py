@@ -12,6 +12,7 @@ from buddyline.protocol.topics import TRACK, TRACK_LAG, key_of
 from buddyline.solver_service import core, tracking
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.trigger import Settings
+from buddyline.solver_service.network.filter import NetFilter
 from buddyline.solver_service.streams import NodeStream
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.tracking import PairTracker, TrackSettings
@@ -234,6 +235,36 @@ def test_the_status_of_a_whole_dive_names_problems_that_ended_before_it_did(iner
     pair = tracks_of(in_g, "filter")[1].pairs["a", "b"]
     assert re.search(r"g in place of m/s\^2; not used \(ended\)", pair.report(0, 0, [], 0, [], over=True).problem)
     assert "g in place" not in pair.report(0, 0, [], 0, []).problem
+
+
+@pytest.mark.parametrize("mode", ["smooth", "filter"])
+def test_pictures_of_another_size_than_the_calibration_s_make_no_track(inertial_dive, mode):
+    halved = [
+        replace(one, width_px=1640, height_px=1232) if isinstance(one, Candidates) and one.node == "b" else one
+        for one in inertial_dive[0]
+    ]
+    tracks, solver = tracks_of(halved, mode)
+    assert tracks == []
+    assert solver.counts["no_info"] > 100
+    said = "pictures of node b are 1640x1232 px, its calibration 820x616: they are not used"
+    assert solver.health.of_dive(("a", "b")) == [said]
+
+
+def test_the_network_takes_no_picture_of_another_size_than_the_calibration_s(monkeypatch):
+    taken = {}
+
+    def noted(self, index, frames):
+        taken.setdefault(self.nodes[index].name, []).extend(frames)
+
+    monkeypatch.setattr(NetFilter, "add_frames", noted)
+    messages = [
+        replace(one, width_px=1640, height_px=1232) if isinstance(one, Candidates) and one.node == "c" else one
+        for one in simulated(3, 5.0, 2.0, imu=False)
+    ]
+    solver = SolverCore(Settings(), track=TrackSettings(frozenset(("filter",))))
+    solver.handle_many(messages)
+    solver.flush()
+    assert (len(taken["a"]) > 5, len(taken["b"]) > 5, taken["c"]) == (True, True, [])
 
 
 @pytest.mark.parametrize("crowded", [False, True])

@@ -17,6 +17,7 @@ from buddyline.solver_service.choices import METHODS
 from buddyline.solver_service.geometry.observation import Method
 from buddyline.tools.cli import COMMANDS, main
 from buddyline.tools.solve import Tracked, _clock_words
+from msgspec.structs import replace
 
 from tests.processes import buddyline
 from tests.solver_service.conftest import dive_messages
@@ -100,6 +101,17 @@ def test_solve_says_why_there_is_no_track_of_poses(capsys, tmp_path):
     _, out, _ = run(capsys, "solve", tmp_path / "dive.mcap", "-o", tmp_path / "out.mcap")
     assert int(re.search(r"(\d+) poses of", out)[1]) > 10
     assert "  no track (smooth): node a told neither attitudes nor inertial samples, so a pose starts none\n" in out
+
+
+def test_solve_names_a_node_whose_pictures_have_another_size_than_its_calibration(capsys, caplog, tmp_path):
+    with DiveLogWriter(tmp_path / "dive.mcap") as writer:
+        for message in dive_messages(seconds=3.0)[0]:
+            other = isinstance(message, NodeInfo) and message.node == "b"
+            writer.write_message(replace(message, width_px=640, height_px=480) if other else message)
+    _, out, _ = run(capsys, "solve", tmp_path / "dive.mcap", "-o", tmp_path / "out.mcap")
+    assert "pictures of node b are 820x616 px, its calibration 640x480: they are not used" in caplog.text
+    assert "28 no_info" in out
+    assert "  no track (smooth): " in out
 
 
 def test_a_track_in_parts_says_for_how_long_it_tells():
