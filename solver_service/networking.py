@@ -20,7 +20,7 @@ from buddyline.solver_service.pace import NO_NETWORK
 from buddyline.solver_service.results import NUMERIC_ERRORS, view_of, wrong_size
 from buddyline.solver_service.streams import STOPPED_NS, NodeStream
 from buddyline.solver_service.track.inputs import DepthSeen
-from buddyline.solver_service.track.problems import as_ended
+from buddyline.solver_service.track.problems import as_ended, merged
 from buddyline.solver_service.track_messages import attitudes_of, fix_of, frame_of, same_rig, track_node_of
 from buddyline.solver_service.tracking import TrackSettings
 from msgspec import UNSET
@@ -96,7 +96,7 @@ class NetTracker:
         """What is wrong, and what was (it says so)."""
         found = self._filter.problems if self._filter is not None else []
         found = [*found, NO_NETWORK] if self._stopped else found
-        return self._past + [problem for problem in found if problem not in self._past]
+        return merged([*self._past, *found])
 
     def take(self, outcomes: Iterable[Message]) -> list[Message]:
         """Go on to where these outcomes allow; return the poses of all nodes up to there."""
@@ -248,4 +248,4 @@ class NetTracker:
         )
 
     def _note(self, problems: Iterable[str]) -> None:
-        self._past += [problem for problem in problems if problem not in self._past]
+        self._past = merged([*self._past, *problems])

@@ -38,7 +38,7 @@ from buddyline.solver_service.track.lag import EVERY_S, KEPT_S, TrackLag
 from buddyline.solver_service.track.lamps import UNSEEN_PICTURES, UNSEEN_S
 from buddyline.solver_service.track.moving import HOLD_S
 from buddyline.solver_service.track.output import TrackRow
-from buddyline.solver_service.track.problems import ENDED_S, as_ended, present
+from buddyline.solver_service.track.problems import ENDED_S, as_ended, merged, present
 from buddyline.solver_service.track.records import NodeRecord, Records, feed, joined
 from buddyline.solver_service.track_messages import (
     attitudes_of,
@@ -162,8 +162,8 @@ class PairTracker:
             return [*self._past, NO_TRACK]
         if self._filter is None:
             return self._past + self._late()
-        found = [problem for problem in self._filter.problems if problem not in self._past]
-        return self._past + self._late() + found + self._dark_lamps(self._filter.lamps.dark())
+        found = merged([*self._past, *self._late(), *self._filter.problems])
+        return found + self._dark_lamps(self._filter.lamps.dark())
 
     def note_late(self, sample: Imu) -> None:
         """Count an inertial sample that comes after the track has passed its time; it has no effect any more."""
@@ -470,7 +470,7 @@ class PairTracker:
         )
 
     def _note(self, problems: Iterable[str]) -> None:
-        self._past += [problem for problem in problems if problem not in self._past]
+        self._past = merged([*self._past, *problems])
 
     def _messages(self, rows: Iterable[TrackRow], mode: TrackMode) -> Iterator[Message]:
         node_a, node_b = (stream.node for stream in self._streams)

@@ -176,6 +176,10 @@ class TrackIntake:
         seen = newest_before(self.attitudes[node], t_s)
         return (seen is None or t_s - seen[0] > GONE_S) and not len(self.samples[node].last(t_s, GONE_S))
 
+    def goes_on_to(self, t_s: float) -> None:
+        """Note that the dive goes on up to t_s, where problems that were found before may have ended."""
+        self._problems.pass_to(t_s)
+
     @property
     def both(self) -> str:
         """The nodes, in words."""

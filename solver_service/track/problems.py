@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from typing import Final
 
 # A problem that is not found again for so long has ended; units are checked every 2 s.
 ENDED_S: Final = 5.0
 _ENDED: Final = " (ended)"
+_FIGURE: Final = re.compile(r"[-+]?\d+(\.\d+)?")
 
 
 def as_ended(problems: Iterable[str]) -> list[str]:
@@ -20,8 +22,19 @@ def present(problems: Iterable[str]) -> list[str]:
     return [problem for problem in problems if not problem.endswith(_ENDED)]
 
 
+def kind_of(problem: str) -> tuple[str, str]:
+    """Return what a problem is of: its nodes, whose ids may have digits, and its text behind them without figures."""
+    nodes, _, text = problem.removesuffix(_ENDED).partition(":")
+    return nodes, _FIGURE.sub("#", text)
+
+
+def merged(problems: Iterable[str]) -> list[str]:
+    """Return the last problem of each kind, in the order of the kinds' first ones."""
+    return list({kind_of(problem): problem for problem in problems}.values())
+
+
 class Problems:
-    """Problems by kind: what they begin and end with around their colons, so that a number between may change."""
+    """Problems by kind, each with its newest figures."""
 
     def __init__(self) -> None:
         self._said: dict[tuple[str, str], tuple[str, float]] = {}
@@ -29,11 +42,9 @@ class Problems:
 
     def report(self, problem: str, t_s: float) -> None:
         """Say a problem, found at t_s."""
-        parts = problem.split(":")
-        kind = parts[0], parts[-1]
-        # The first text stays: numbers in it would change it again and again.
-        text, last_s = self._said.get(kind, (problem, t_s))
-        self._said[kind] = problem if t_s - last_s > ENDED_S else text, max(last_s, t_s)
+        kind = kind_of(problem)
+        said, last_s = self._said.get(kind, (problem, t_s))
+        self._said[kind] = (problem, t_s) if t_s >= last_s else (said, last_s)
         self.pass_to(t_s)
 
     def pass_to(self, t_s: float) -> None:

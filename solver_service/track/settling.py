@@ -12,7 +12,7 @@ from buddyline.protocol.clock import S_NS
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.output import CONTRADICTS, fix_chi2
-from buddyline.solver_service.track.records import pass_over
+from buddyline.solver_service.track.records import last_ns, pass_over
 from buddyline.solver_service.track.relax import PassedOver, PathPass
 from buddyline.solver_service.track.search import FURTHEST_M
 from buddyline.solver_service.track.seeing import ONE_TRIGGER_S
@@ -128,6 +128,8 @@ def _settled(
                 continue
             fits = passed.surprise < UNFIT * passed.told and sum(passed.told_by) > LEAST_TOLD * asked.told
             fits = fits and not (guesses and (_used(path) < GUESSING_TOLD * asked.used).any())
+            # A path may end long before the dive does: what is wrong at its end may have ended.
+            track.goes_on_to(track.seconds(0, last_ns(known.records) - S_NS))
             near = np.linalg.norm(path.states[:, R_], axis=1).max() < FURTHEST_M
             return (track, path) if near and (fits or not (doubtful or guesses)) else None
     return None
