@@ -23,6 +23,7 @@ from tests.tools.evaluated import (
     light_truth,
     pose,
     rejection,
+    track,
     truth,
     write_log,
 )
@@ -75,6 +76,19 @@ def test_the_table_has_the_main_figures(tmp_path, capsys):
     for words in ("3 poses of 4 triggers", "1 ambiguous", "75.0 %", "position, m", "NEES", "recall within 2 px"):
         assert words in text
     assert "nan" not in text
+
+
+def test_coverage_of_a_track_without_poses_is_of_the_triggers(tmp_path, capsys):
+    """Both nodes took ten pictures; the track has the first half of that time."""
+    frames = [frame(node, k) for k in range(10) for node in "ab"]
+    tracks = [track(k, mode="smooth") for k in range(6)]
+    outcomes = [rejection(k) for k in range(10)]
+    truths = [truth(k) for k in range(10)]
+    solved = write_log(tmp_path / "o.mcap", *INFOS.values(), *frames, *outcomes, *tracks, *truths)
+    assert main(["evaluate", solved]) == 0
+    assert "covers 66.7 % of the time from the first to the last trigger;" in capsys.readouterr().out
+    (figures,) = evaluated(capsys, solved)["tracks"]
+    assert figures["covered_from"] == "trigger"
 
 
 def test_poses_in_ned_are_judged_by_true_ned_only(tmp_path, capsys):

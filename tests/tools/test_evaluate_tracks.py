@@ -138,7 +138,21 @@ def test_time_without_a_sample_or_with_a_wide_sigma_is_not_covered():
     assert covered_share(half, poses) == pytest.approx(0.5, abs=0.02)
     assert covered_share(half[:50], poses) == pytest.approx(0.5, abs=0.02)
     assert covered_share([], poses) == 0.0
-    assert covered_share(half, poses[:1]) is None
+
+
+def test_below_two_poses_the_time_from_the_first_to_the_last_trigger_is_to_be_covered():
+    tracks = [track(k, [0, 0, 4.0]) for k in range(50, 100)]
+    triggers_ns = [k * PERIOD_NS for k in range(0, 200, 5)]
+    for poses in ([], [Pose(60 * PERIOD_NS)]):
+        assert covered_share(tracks, poses) is None
+        assert covered_share(tracks, poses, triggers_ns) == pytest.approx(50 / 195, abs=0.01)
+        assert covered_share([], poses, triggers_ns) == 0.0
+        (figures,) = tracks_figures(tracks, poses, truths(100), triggers_ns=triggers_ns)
+        assert (figures.covered_from, figures.covered) == ("trigger", covered_share(tracks, poses, triggers_ns))
+    # Two poses say more of where there was something to be seen.
+    poses = [Pose(60 * PERIOD_NS), Pose(80 * PERIOD_NS)]
+    assert covered_share(tracks, poses, triggers_ns) == covered_share(tracks, poses) == 1.0
+    assert tracks_figures(tracks, poses, truths(100), triggers_ns=triggers_ns)[0].covered_from == "pose"
 
 
 def test_each_mode_has_its_own_figures():

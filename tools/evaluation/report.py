@@ -138,7 +138,8 @@ def _track_text(track: TrackFigures) -> str:
         _stats_row("NEES, position (honest: mean 3)", track.nees3, 2),
     ]
     return (
-        f"track ({track.mode}): covers {percent(track.covered)} of the time from the first to the last pose;"
+        f"track ({track.mode}): covers {percent(track.covered)} of the time"
+        f" from the first to the last {track.covered_from};"
         f" wrong: {track.wrong} of {track.samples}, in gaps {track.wrong_in_gaps}\n"
         f"{text_table(rows)}{_ned_text(track.ned)}"
     )

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
-from buddyline.protocol.messages import Candidates
+from buddyline.protocol.messages import Candidates, Rejected
 from buddyline.tools.evaluation.detection import DetectionFigures, detection_figures
 from buddyline.tools.evaluation.lights import Blobs, is_right_pair, true_lights
 from buddyline.tools.evaluation.ned import NedHonesty, ned_honesty
@@ -108,6 +108,12 @@ def _bins(errors: PoseErrors, visible: Sequence[VisibleTrigger]) -> list[RangeBi
     return bins
 
 
+def _triggers_ns(frames: Iterable[Candidates], rejected: Iterable[Rejected]) -> list[int]:
+    """Return when triggers were: without candidates, by outcomes. A late frame's stamp may be far off."""
+    pictured = [frame.stamp_ns for frame in frames]
+    return pictured or [one.stamp_ns for one in rejected if one.reason != "late"]
+
+
 def evaluate(recorded: Recorded) -> Result:
     """Compare one pair's messages with truth.
 
@@ -144,7 +150,7 @@ def evaluate(recorded: Recorded) -> Result:
         bins=_bins(errors, seen),
         pairing=pairing_figures(seen),
         detection=detection_figures(lights, blobs),
-        tracks=tracks_figures(recorded.tracks, poses, track, true_ned_a),
+        tracks=tracks_figures(recorded.tracks, poses, track, true_ned_a, _triggers_ns(frames.values(), rejected)),
         errors=errors,
         environment=recorded.environment,
         ned=ned_honesty(compared, true_ned_a),

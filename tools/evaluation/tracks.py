@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
@@ -27,14 +27,16 @@ GAP_S: Final = NO_LIGHT_S
 class TrackFigures:
     """The figures of one mode of a pair's track. samples: number with truth. wrong_in_gaps: wrong samples in a gap.
 
-    covered: share of the time from the first to the last pose that it covers. worst_m: largest position error. nees6,
-    nees3: means are 6 and 3 if the covariance is true; where truth is sparse, of the samples at its instants alone.
-    in_gaps_m, outside_m: position errors in and outside gaps. ned: None without true NED.
+    covered: share of the time that it covers. covered_from: that time is from the first to the last pose, or trigger
+    where there are no two poses. worst_m: largest position error. nees6, nees3: means are 6 and 3 if the covariance is
+    true; where truth is sparse, of the samples at its instants alone. in_gaps_m, outside_m: position errors in and
+    outside gaps. ned: None without true NED.
     """
 
     mode: TrackMode
     samples: int
     covered: float | None
+    covered_from: Literal["pose", "trigger"]
     wrong: int
     wrong_in_gaps: int
     position_m: Stats
@@ -52,14 +54,16 @@ def tracks_figures(
     poses: Sequence[RelativePose],
     truth: TruthTrack,
     ned_camera_a: PoseHistory | None = None,
+    triggers_ns: Collection[int] = (),
 ) -> list[TrackFigures]:
     """Return the figures of each mode among the tracks, in the order of the modes' first samples.
 
-    ned_camera_a: node a's true camera poses in NED.
+    ned_camera_a: node a's true camera poses in NED. triggers_ns: stamps of the triggers, as covered_share takes them.
     """
     modes = dict.fromkeys(track.mode for track in tracks)
     return [
-        _figures(mode, [track for track in tracks if track.mode == mode], poses, truth, ned_camera_a) for mode in modes
+        _figures(mode, [track for track in tracks if track.mode == mode], poses, truth, ned_camera_a, triggers_ns)
+        for mode in modes
     ]
 
 
@@ -69,6 +73,7 @@ def _figures(
     poses: Sequence[RelativePose],
     truth: TruthTrack,
     ned_camera_a: PoseHistory | None,
+    triggers_ns: Collection[int],
 ) -> TrackFigures:
     found = [(track, known) for track in tracks if (known := truth.interpolated(track.stamp_ns)) is not None]
     off = differences(found)
@@ -79,7 +84,8 @@ def _figures(
     return TrackFigures(
         mode=mode,
         samples=len(found),
-        covered=covered_share(tracks, poses),
+        covered=covered_share(tracks, poses, triggers_ns),
+        covered_from=covered_from(poses),
         wrong=int(wrong.sum()),
         wrong_in_gaps=int((wrong & in_gap).sum()),
         position_m=Stats.of(off.translation_m),
@@ -93,16 +99,25 @@ def _figures(
     )
 
 
-def covered_share(tracks: Sequence[Track], poses: Sequence[RelativePose]) -> float | None:
-    """Return the share of the time between first and last pose that is covered; None below two poses.
+def covered_from(poses: Sequence[RelativePose]) -> Literal["pose", "trigger"]:
+    """Return between the first and the last of what a track should cover a dive."""
+    return "pose" if len(poses) > 1 else "trigger"
 
-    Time is counted in the track's median period, so a missing sample counts as not covered.
+
+def covered_share(
+    tracks: Sequence[Track], poses: Sequence[RelativePose], triggers_ns: Collection[int] = ()
+) -> float | None:
+    """Return the share of the time between first and last pose that is covered; below two poses, of the triggers'.
+
+    triggers_ns: stamps of pictures or outcomes; None where there are not two either. Time is counted in the track's
+    median period, so a missing sample counts as not covered.
     """
-    if len(poses) < 2:
+    ends_ns = triggers_ns if covered_from(poses) == "trigger" else [pose.stamp_ns for pose in poses]
+    if len(ends_ns) < 2:
         return None
     if len(tracks) < 2:
         return 0.0
-    first_ns, last_ns = min(pose.stamp_ns for pose in poses), max(pose.stamp_ns for pose in poses)
+    first_ns, last_ns = min(ends_ns), max(ends_ns)
     stamps_ns = np.sort(np.array([track.stamp_ns for track in tracks]))
     period_s = float(np.median(np.diff(stamps_ns))) / S_NS
     if last_ns <= first_ns or period_s <= 0.0:

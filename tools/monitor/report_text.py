@@ -10,6 +10,7 @@ from typing import Any, Final
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.health import TRACK_SIGMA_SHARE
 from buddyline.tools.draw.page import table
+from buddyline.tools.evaluation.tracks import covered_from
 from buddyline.tools.monitor.coverage import clock_words
 from buddyline.tools.monitor.outliers import GATE, Outlier
 from buddyline.tools.monitor.panel import length_words
@@ -54,7 +55,7 @@ def methods_html(numbers: dict[str, Any], summary: Summary) -> str:
         if track["covered"] is not None:
             said.append(
                 f"Its position's 1 sd is below {TRACK_SIGMA_SHARE:.0%} of the range during {track['covered']:.1%} of "
-                "the time between the first and the last pose."
+                f"the time between the first and the last {covered_from(summary.poses)}."
             )
     north = "true north" if infos and infos[0].declination_rad else "magnetic north"
     if numbers["error_budget"]["compass_m"] is not None:

@@ -77,11 +77,14 @@ class Summary:
 
     def track_figures(self) -> list[TrackFigures]:
         """Compare the track with the truth, at those points that are kept."""
-        return tracks_figures(self._samples(), self.poses, TruthTrack(self.truths))
+        return tracks_figures(self._samples(), self.poses, TruthTrack(self.truths), triggers_ns=self.asked.values())
 
     def covered(self) -> float | None:
-        """Return the share of the time from the first to the last pose that the track covers."""
-        return covered_share(self._samples(), self.poses)
+        """Return the share of the time from the first to the last pose that the track covers.
+
+        Below two poses, it is of the time from the first to the last trigger.
+        """
+        return covered_share(self._samples(), self.poses, self.asked.values())
 
     def drawn(self) -> list[Point]:
         """Return B's path: the track, or the poses if there is no track."""
