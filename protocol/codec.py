@@ -12,8 +12,12 @@ from typing import Any, Final, TypeVar
 import msgspec
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message
+from buddyline.protocol.refused import field_of, value_at, without_field
 
 MAX_MESSAGE_BYTES: Final = 16 * 1024 * 1024
+# Of a refused message so long at most the error names the value, if it is so long at most as JSON.
+MAX_READ_AGAIN_BYTES: Final = 256 * 1024
+MAX_VALUE_LENGTH: Final = 60
 
 M = TypeVar("M", bound=Message)
 
@@ -40,8 +44,8 @@ def decode(payload: bytes, schema: type[M]) -> M:
     try:
         message: M = decoder.decode(payload)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        where = _non_finite_field(payload)
-        raise MessageError(f"{schema.__name__}: {where or error}") from error
+        where = _non_finite_field(payload) or _named(str(error), payload)
+        raise MessageError(f"{schema.__name__}: {where}") from error
     return message
 
 
@@ -63,6 +67,18 @@ def _non_finite_field(payload: bytes) -> str | None:
         elif isinstance(value, list):
             stack.extend((f"{path}[{i}]", item) for i, item in enumerate(value))
     return None
+
+
+def _named(error: str, payload: bytes) -> str:
+    """Return an error with the refused value, where that is a short one; a message is read again for that."""
+    field = field_of(error)
+    if not field or len(payload) > MAX_READ_AGAIN_BYTES:
+        return error
+    try:
+        value = json.dumps(value_at(msgspec.json.decode(payload), field))
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, LookupError):
+        return error
+    return f"{field} = {value}: {without_field(error, field)}" if len(value) <= MAX_VALUE_LENGTH else error
 
 
 class _Stamp(msgspec.Struct):

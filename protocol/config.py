@@ -11,6 +11,7 @@ from typing import Any, Final, TypeVar
 
 import msgspec
 from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.refused import field_of, value_at, without_field
 
 C = TypeVar("C", bound=msgspec.Struct)
 # Text longer than this is a large survey's: there rtoml, where it is installed, takes a sixth of tomllib's time.
@@ -67,8 +68,7 @@ def config_sha256(config: msgspec.Struct) -> str:
 
 def _explain(error: str, table: dict[str, Any], schema: type[msgspec.Struct]) -> str:
     """Add the value, or the nearest known key, to msgspec's message."""
-    place = re.search(r"at `\$\.?(.*?)`\Z", error)
-    field = place.group(1) if place else ""
+    field = field_of(error)
     unknown = re.search(r"unknown field `(.*?)`", error)
     if unknown:
         known = _keys_at(schema, field)
@@ -76,14 +76,11 @@ def _explain(error: str, table: dict[str, Any], schema: type[msgspec.Struct]) ->
         where = f"[{field}] " if field else ""
         hint = f"did you mean `{near[0]}`?" if near else f"known: {', '.join(known)}"
         return f"{where}unknown key `{unknown.group(1)}`; {hint}"
-    value: Any = table
-    for part in re.findall(r"[^.\[\]]+", field):
-        try:
-            value = value[int(part)] if isinstance(value, list) else value[part]
-        except (KeyError, IndexError, TypeError, ValueError):
-            return error
-    message = error.removesuffix(f" - at `$.{field}`")
-    return f"{field} = {value!r}: {message}" if field else error
+    try:
+        value = value_at(table, field)
+    except LookupError:
+        return error
+    return f"{field} = {value!r}: {without_field(error, field)}" if field else error
 
 
 def _keys_at(schema: type[msgspec.Struct], field: str) -> list[str]:

@@ -1,7 +1,9 @@
 """Bytes and messages: every decoded message is valid, and no invalid message is encoded."""
 
 import contextlib
+import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -21,6 +23,39 @@ def test_malformed_payloads_are_refused(payload):
 def test_unknown_fields_are_ignored():
     payload = b'{"node":"a","stamp_ns":7,"depth_m":3.0,"sigma_m":1.0,"mood":"calm"}'
     assert decode(payload, Depth) == Depth(node="a", stamp_ns=7, depth_m=3.0, sigma_m=1.0)
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"sigma_m": -3.0}, "Depth: sigma_m = -3.0: Expected `float` >"),
+        ({"depth_m": "deep\n"}, 'Depth: depth_m = "deep\\n": Expected `float`, got `str`'),
+        ({"stamp_ns": -1}, "Depth: stamp_ns = -1: Expected `int` >= 0"),
+        # A long value is left out, and a missing field has none.
+        ({"node": "x" * 100}, "Depth: Expected `str` matching regex '^[a-z0-9_]{1,32}\\\\Z' - at `$.node`"),
+        ({"node": None}, "Depth: node = null: Expected `str`, got `null`"),
+    ],
+)
+def test_a_refused_field_is_named_with_its_value(changed, says):
+    message = {"node": "a", "stamp_ns": 7, "depth_m": 3.0, "sigma_m": 1.0} | changed
+    with pytest.raises(MessageError) as refused:
+        decode(json.dumps(message).encode(), Depth)
+    assert str(refused.value).startswith(says)
+
+
+def test_a_refused_value_within_lists_is_named_in_its_place():
+    blob = Blob(u_px=1.0, v_px=1.0, sigma_px=0.5, area_px=3.0, peak=200, elongation=1.0)
+    frame = Candidates(
+        node="a", stamp_ns=0, trigger=0, seq=0, boot="x", width_px=820, height_px=616, blobs=[blob, blob]
+    )
+    payload = json.loads(encode(frame))
+    payload["blobs"][1]["sigma_px"] = 0.0
+    with pytest.raises(MessageError, match=re.escape("Candidates: blobs[1].sigma_px = 0.0: Expected `float` > 0.0")):
+        decode(json.dumps(payload).encode(), Candidates)
+    # Nothing reads a huge message again for the value.
+    payload["mood"] = "x" * 300_000
+    with pytest.raises(MessageError, match=r"^Candidates: Expected"):
+        decode(json.dumps(payload).encode(), Candidates)
 
 
 def test_no_invalid_message_is_encoded():
