@@ -151,7 +151,7 @@ def _of_bars(
     off_s = (clock_ns - told_ns) * 1e-9
     far = in_pieces(parts) or clock_off_by(parts[-1], MOST_LEFT_S)
     if far or (without and abs(off_s) > FAR_WITHOUT_S):
-        said = f"{first.both}: their clocks seem some {off_s:.2f} s apart, which cannot be told well enough: no track"
+        said = f"{first.both}: {why_none(off_s)}: no track"
         return Smoothed([], clock_ns * 1e-9, math.inf, [*first.problems, said])
     if without:
         # Without a gyro the offset cannot be told from the turning, and is taken as it was told. The first pass has
@@ -200,6 +200,16 @@ def _of_bars(
         return Smoothed([], clock_ns * 1e-9, math.inf, [*first.problems, *lost])
     whole = _rows_of(found, outputs_ns, gap)
     return replace(whole, problems=[*whole.problems, *lost])
+
+
+def why_none(off_s: float) -> str:
+    """Say why a first pass that is in pieces, or finds the clocks far off, gives no track. off_s: what it found."""
+    if abs(off_s) > FAR_WITHOUT_S:
+        return f"their clocks seem some {off_s:.2f} s apart, which cannot be told well enough"
+    return (
+        "the parts of the dive contradict each other: an inertial unit is mounted otherwise than stated, rig or camera "
+        "are not as calibrated, or a clock jumped"
+    )
 
 
 def _unrest(parts: Sequence[Estimate]) -> float:

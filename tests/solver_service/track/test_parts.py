@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from buddyline.solver_service.track.dive import why_none
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.parts import goes_on, in_pieces, of_one_clock, parts_of
 from buddyline.solver_service.track.state import CLOCK
@@ -86,3 +87,9 @@ def test_a_track_that_contradicts_the_others_on_the_clocks_is_left_out(
         for k, (clock_s, explained) in enumerate(zip(clocks_s, evidence, strict=True))
     ]
     assert [parts.index(one) for one in of_one_clock(parts)] == kept
+
+
+def test_why_there_is_no_track_is_laid_on_the_clocks_only_where_they_are_far_apart() -> None:
+    assert "their clocks seem some 0.30 s apart" in why_none(0.3)
+    assert "clocks" not in why_none(0.001)
+    assert "mounted otherwise than stated" in why_none(0.001)
