@@ -37,6 +37,7 @@ from buddyline.solver_service.track.records import (
     Records,
     feed,
     in_order,
+    judged,
     parted,
     pass_over,
     stamp_of,
@@ -99,7 +100,7 @@ def smooth(
     that each, and the sigmas hold that one of them alone may be wrong.
     """
     a, b = until_one_ended((in_order(records[0]), in_order(records[1])), clock_ns)
-    records, fixes, gap = (parted(a), parted(b)), sorted(fixes, key=stamp_of), 0.0
+    records, fixes, gap = (judged(parted(a)), judged(parted(b))), sorted(fixes, key=stamp_of), 0.0
     for left in reversed(range(GAP_ROUNDS)):
         found = _of_bars(records, fixes, outputs_ns, clock_ns, gap, again=again, closes=left > 0)
         if isinstance(found, Smoothed):

@@ -225,6 +225,9 @@ class TrackFilter(TrackPool):
         self._search(t_s, sight)
         self._search_window(t_s)
 
+    def _begin_anew(self) -> None:
+        self.main, self.challengers, self._apart_s = None, [], -np.inf
+
     def _go_on_alone(self, t_s: float, gone: int) -> None:
         """Go on to a picture that is not used, because the node that it may show is gone."""
         if self.main is not None and self.main.confirmed:

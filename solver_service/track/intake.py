@@ -11,12 +11,21 @@ from typing import Final, TypeVar
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.track.gyros import (
+    EVERY_S,
+    FAULTY,
+    SPAN_S,
+    WELL,
+    TurningTold,
+    gyro_fault,
+    turns_of,
+)
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, Stamps, TrackNode
 from buddyline.solver_service.track.lights import Sight, sights_of
 from buddyline.solver_service.track.problems import Problems
 from buddyline.solver_service.track.samples import Samples
 from buddyline.solver_service.track.turning import Turning
-from buddyline.solver_service.track.units import clipped, fault_of
+from buddyline.solver_service.track.units import clipped, fault_of, stuck
 
 CHECK_EVERY_S: Final = 2.0
 SILENT_S: Final = 1.0
@@ -53,6 +62,10 @@ class TrackIntake:
         self.turning = [Turning() for _ in nodes]
         self._count = 0
         self._checked_s = -np.inf
+        self._compared_s = -np.inf
+        self._gyro_faults: dict[int, str] = {}
+        # Of nodes whose unit was judged by the whole dive: from when to when it is faulty, s, and why.
+        self._known_faults: dict[int, list[tuple[float, float, str]]] = {}
         self._rejected = [0 for _ in nodes]
         # Of each node that has a picture, when its last one was, and how long after the one before.
         self._pictured_s: dict[int, tuple[float, float]] = {}
@@ -90,6 +103,12 @@ class TrackIntake:
         if fast is not None:
             fast = np.hstack((fast[:, :3] @ R_body_camera, fast[:, 3:6] @ R_body_camera, fast[:, 6:]))
         self.samples[node].add(times_s, values, fast)
+
+    def know_faults(self, node: int, faults: Sequence[tuple[int, int, str]]) -> None:
+        """Take when a node's unit is faulty, by its stamps, and why; its gyro is not judged on the way then."""
+        self._known_faults[node] = [
+            (self.seconds(node, start_ns), self.seconds(node, end_ns), said) for start_ns, end_ns, said in faults
+        ]
 
     def take_off(self, shares: Floats) -> None:
         """Use the samples without these shares (2 nodes, 2: force, rate) of their fast parts."""
@@ -137,27 +156,77 @@ class TrackIntake:
     def _check_units(self, t_s: float) -> None:
         """Every seconds, say what is wrong with a unit; it is not used until it is well again."""
         self._problems.pass_to(t_s)
+        for node in self._known_faults:
+            if self._fault_found(node, t_s) is not None:
+                self.samples[node].trusted = False
         if t_s - self._checked_s < CHECK_EVERY_S:
             return
         # At the dive's start there is little to judge by: at every picture, until there is enough.
         if min(len(samples.last(t_s, CHECK_EVERY_S)) for samples in self.samples) > 100:
             self._checked_s = t_s
+        if t_s - self._compared_s > EVERY_S:
+            self._compared_s = t_s
+            self._compare_gyros(t_s)
         for node, samples in enumerate(self.samples):
             seen = newest_before(self.attitudes[node], t_s)
             down = None
             if seen is not None and t_s - seen[0] < 0.5:
                 down = self.level_camera(node, seen[1])[2]
-            fault = fault_of(self.nodes[node].name, samples.last(t_s, CHECK_EVERY_S)[:, :3], down)
+            name, lately = self.nodes[node].name, samples.last(t_s, CHECK_EVERY_S)
+            unchanging, found = stuck(name, lately), self._fault_found(node, t_s)
+            if unchanging is None:
+                fault = fault_of(name, lately[:, :3], down) or found
+            else:
+                fault = found if found and node in self._known_faults else unchanging
+                if samples.trusted:
+                    self._begin_anew()
             samples.trusted = fault is None
             if fault is not None:
                 self._problems.report(fault, t_s)
+                self._rejected[node] = samples.rejected
             elif len(samples) and not (len(samples.last(t_s + SILENT_S, 2.0 * SILENT_S)) or self.gone(node, t_s)):
-                name = self.nodes[node].name
                 self._problems.report(f"node {name}: inertial samples are missing: the track does without them", t_s)
             if samples.rejected > self._rejected[node]:
-                which = f"node {self.nodes[node].name}: {samples.rejected} inertial samples so far are left out"
+                which = f"node {name}: {samples.rejected} inertial samples so far are left out"
                 self._problems.report(f"{which}: not finite, clipped, sent twice or far from their neighbours", t_s)
                 self._rejected[node] = samples.rejected
+
+    def _compare_gyros(self, t_s: float) -> None:
+        """Judge gyros by the attitudes of the last seconds; where these do not tell, what was found stays."""
+        for node, samples in enumerate(self.samples):
+            if node in self._known_faults:
+                continue
+            turns = turns_of(self._turning_told(node, t_s - SPAN_S, t_s))
+            found = gyro_fault(turns) if turns is not None else None
+            if found is None:
+                continue
+            if found.gain < -WELL:
+                self._gyro_faults.pop(node, None)
+            elif found.gain > FAULTY:
+                used = node not in self._gyro_faults and samples.trusted
+                self._gyro_faults[node] = found.of(self.nodes[node].name)
+                if used:
+                    self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        """Drop what samples of a faulty unit have told for seconds."""
+
+    def _turning_told(self, node: int, start_s: float, end_s: float) -> TurningTold:
+        items, samples = self.attitudes[node], self.samples[node]
+        seen = items[bisect.bisect_left(items, start_s, key=_time_of) : bisect.bisect_left(items, end_s, key=_time_of)]
+        first, stop = np.searchsorted(samples.times_s, (start_s, end_s))
+        return TurningTold(
+            np.array([at_s for at_s, _ in seen]),
+            np.array([one.R_ned_body for _, one in seen]).reshape(-1, 3, 3),
+            np.array([one.sigma_rad for _, one in seen]).reshape(-1, 3),
+            samples.times_s[first:stop],
+            samples.values[first:stop, 3:] @ self.nodes[node].rig.R_body_camera.T,
+        )
+
+    def _fault_found(self, node: int, t_s: float) -> str | None:
+        if node not in self._known_faults:
+            return self._gyro_faults.get(node)
+        return next((said for start_s, end_s, said in self._known_faults[node] if start_s <= t_s < end_s), None)
 
     def _hear(self, node: int, t_s: float) -> None:
         """Note a node's picture, which has its turn."""

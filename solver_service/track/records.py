@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final, TypeAlias, TypeVar
@@ -10,6 +11,7 @@ from typing import Final, TypeAlias, TypeVar
 import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.track.gyros import TurningTold, faulty_spans, gyro_faults
 from buddyline.solver_service.track.inputs import (
     Attitudes,
     AttitudeSeen,
@@ -19,9 +21,10 @@ from buddyline.solver_service.track.inputs import (
     Stamps,
     TrackNode,
 )
-from buddyline.solver_service.track.intake import TrackIntake
+from buddyline.solver_service.track.intake import BEYOND, TrackIntake
 from buddyline.solver_service.track.samples import false_ones, sound_ones
 from buddyline.solver_service.track.stepping import TrackSteps
+from buddyline.solver_service.track.units import clipped, stuck_runs, stuck_words
 from buddyline.solver_service.track.vibration import fast_part, sudden_turn
 
 # A dive is fed in pieces of this length, each further than the filter is brought: samples are needed ahead of it.
@@ -37,7 +40,8 @@ class NodeRecord:
     """What one node recorded, in order of stamps.
 
     Inertial columns: stamps (N,), accel and gyro (N, 3), body frame; fast (N, 7): the fast part of both and the
-    camera's sudden turn, where known.
+    camera's sudden turn, where known. faults: from when to when, by the node's stamps, the unit is stuck or its gyro
+    turns otherwise, by all of the dive, and that in words; None where it is to be judged on the way.
     """
 
     node: TrackNode
@@ -48,6 +52,7 @@ class NodeRecord:
     attitudes: Sequence[AttitudeSeen] = ()
     depths: Sequence[DepthSeen] = ()
     fast: Floats | None = None
+    faults: Sequence[tuple[int, int, str]] | None = None
 
     def between(self, start_ns: int, end_ns: int) -> NodeRecord:
         """Give what was recorded from start_ns on and before end_ns."""
@@ -135,6 +140,45 @@ def parted(record: NodeRecord) -> NodeRecord:
     return replace(record, fast=np.column_stack((*of_each, sudden_turn(stamps_ns, values[:, 3:]))))
 
 
+def judged(record: NodeRecord) -> NodeRecord:
+    """Give a record in order with its unit's faults, by all of it."""
+    faults = _stuck(record)
+    stamps_ns, attitudes = record.imu_stamps_ns, Attitudes.joined([record.attitudes])
+    if not len(stamps_ns) or not len(attitudes):
+        return replace(record, faults=faults)
+    epoch_ns = int(stamps_ns[0])
+    with np.errstate(invalid="ignore"):
+        sound = (np.abs(record.gyro_radps) < BEYOND).all(axis=1) & ~clipped(record.gyro_radps)
+    sound[1:] &= np.diff(stamps_ns) > 0
+    told = TurningTold(
+        np.asarray(attitudes.stamps_ns - epoch_ns, np.float64) * 1e-9,
+        attitudes.R_ned_body,
+        attitudes.sigma_rad,
+        np.asarray(stamps_ns[sound] - epoch_ns, np.float64) * 1e-9,
+        record.gyro_radps[sound],
+    )
+    faults += [
+        (
+            epoch_ns if math.isinf(start_s) else epoch_ns + round(start_s * 1e9),
+            END_NS if math.isinf(end_s) else epoch_ns + round(end_s * 1e9),
+            fault.of(record.node.name),
+        )
+        for start_s, end_s, fault in faulty_spans(list(gyro_faults(told)))
+    ]
+    return replace(record, faults=faults)
+
+
+def _stuck(record: NodeRecord) -> list[tuple[int, int, str]]:
+    """Give from when to when, by stamps, force or rate do not change for a second, and that in words."""
+    found = []
+    for values, of_rate in ((record.accel_mps2, False), (record.gyro_radps, True)):
+        for first, last in stuck_runs(values):
+            start_ns, end_ns = record.imu_stamps_ns[[first, last]].tolist()
+            if end_ns - start_ns > S_NS:
+                found.append((start_ns, end_ns, stuck_words(record.node.name, not of_rate, of_rate)))
+    return found
+
+
 def last_ns(records: Records) -> int:
     """Give a stamp well after all that was recorded."""
     stamps = [0]
@@ -145,6 +189,8 @@ def last_ns(records: Records) -> int:
 
 def feed(track: TrackIntake, node: int, record: NodeRecord) -> None:
     """Give a filter what a node recorded."""
+    if record.faults is not None:
+        track.know_faults(node, record.faults)
     track.add_imu(node, record.imu_stamps_ns, record.accel_mps2, record.gyro_radps, record.fast)
     for attitude in record.attitudes:
         track.add_attitude(node, attitude)

@@ -63,7 +63,7 @@ class Turning:
             return None
         t = np.array(self._t[first:stop]) - t_s
         middle = self._R[(first + stop) // 2]
-        off = _small_log(middle.T @ np.array(self._R[first:stop]))
+        off = small_log(middle.T @ np.array(self._R[first:stop]))
         mean_t = float(t.mean())
         spread = float(((t - mean_t) ** 2).sum())
         if spread <= 0.0 or t[0] > 0.03 or t[-1] < -0.03:
@@ -77,13 +77,13 @@ class Turning:
             return
         self._white_s = t_s
         R = np.array(self._R[max(last - 100, 0) : last])
-        steps = _small_log(np.swapaxes(R[:-1], 1, 2) @ R[1:])
+        steps = small_log(np.swapaxes(R[:-1], 1, 2) @ R[1:])
         third = np.diff(steps, 2, axis=0)
         white = np.median(np.abs(third), axis=0) / (0.6745 * np.sqrt(20.0))
         self._white = np.maximum(white, FLOOR_RAD)
 
 
-def _small_log(R: Floats) -> Floats:
+def small_log(R: Floats) -> Floats:
     """Give the rotation vectors (..., 3) of small turns (..., 3, 3)."""
     vector: Floats = 0.5 * np.stack(
         (R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]), axis=-1

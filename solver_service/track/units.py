@@ -1,8 +1,9 @@
-"""Whether an inertial unit says what its node says of it: units, axes, saturation."""
+"""Whether an inertial unit says what its node says of it: units, axes, saturation. Of its turns, see gyros.py."""
 
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -17,6 +18,9 @@ LIGHTEST_MPS2: Final = 7.0
 HEAVIEST_MPS2: Final = 13.0
 # Beyond this angle between its gravity and the attitude's the unit stands otherwise than stated.
 MISMOUNTED_RAD: Final = math.radians(30.0)
+# Real samples have noise. So many that differ by less are one sample, sent again and again.
+LEAST_STUCK: Final = 50
+STUCK: Final = 1e-9
 
 
 def clipped(rate_radps: Floats) -> Bools:
@@ -24,6 +28,29 @@ def clipped(rate_radps: Floats) -> Bools:
     size = np.abs(rate_radps)[..., None]
     at_end: Bools = (np.abs(size - FULL_SCALES_RADPS) < CLIPPED_SHARE * FULL_SCALES_RADPS).any(-1).any(-1)
     return at_end
+
+
+def stuck(node: str, values: Floats) -> str | None:
+    """Say which of seconds of force and rate (N, 6) never change; None where all do, or too few are there."""
+    if len(values) < LEAST_STUCK:
+        return None
+    force, rate = (bool((np.ptp(each, axis=0) < STUCK).all()) for each in (values[:, :3], values[:, 3:6]))
+    if not (force or rate):
+        return None
+    return stuck_words(node, force, rate)
+
+
+def stuck_words(node: str, force: bool, rate: bool) -> str:
+    """Say that a unit's force, its rate or both do not change."""
+    which = "inertial" if force and rate else "accelerometer's" if force else "gyro's"
+    return f"node {node}: the {which} samples do not change for seconds, as of a unit that is stuck; not used"
+
+
+def stuck_runs(values: Floats) -> list[tuple[int, int]]:
+    """Give first and last row of each run of at least LEAST_STUCK of the values (N, 3) that do not change."""
+    changes = (np.abs(np.diff(values, axis=0)) >= STUCK).any(axis=1)
+    ends = np.concatenate(((-1,), np.flatnonzero(changes), (len(values) - 1,)))
+    return [(a + 1, b) for a, b in pairwise(ends.tolist()) if b - a >= LEAST_STUCK]
 
 
 def fault_of(node: str, force_mps2: Floats, down_camera: Floats | None) -> str | None:
