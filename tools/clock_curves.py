@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import ConfigError
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import ClockBeacon, HeardClock
 from buddyline.protocol.topics import CLOCK
 from buddyline.solver_service.clock_curve import ClockCurve
@@ -30,6 +31,10 @@ EVERY_NS: Final = 10 * S_NS
 MIN_SPAN_NS: Final = 60 * S_NS
 # Beacons cover a dive that begins and ends less than this outside of them.
 OUTSIDE_NS: Final = 120 * S_NS
+# The name of `curves_text` in the metadata of a solved dive.
+CURVES: Final = "clock_curves"
+# A curve with more points is noted by so many, evenly spaced.
+NOTED: Final = 101
 
 
 @dataclass(frozen=True)
@@ -192,3 +197,25 @@ def load_curve(path: str, pair: tuple[str, str], dive: Dive) -> ClockCurve:
     if (a, b) != pair:
         raise ConfigError(f"--clocks {path}: is of nodes {a} and {b}, not of {pair[0]} and {pair[1]}")
     return ClockCurve.line(offset_s, at_ns, drift, dive.start_ns, dive.end_ns)
+
+
+def curves_text(curves: Mapping[str, ClockCurve]) -> str:
+    """Return the curves that a dive was solved with, as its metadata have them."""
+    noted = {}
+    for node, curve in curves.items():
+        stamps_ns, offsets_ns = curve.stamps_ns.tolist(), curve.offsets_ns.tolist()
+        if len(stamps_ns) > NOTED:
+            first_ns, span_ns = stamps_ns[0], stamps_ns[-1] - stamps_ns[0]
+            stamps_ns = [first_ns + span_ns * step // (NOTED - 1) for step in range(NOTED)]
+            offsets_ns = [curve.offset_ns(stamp_ns) for stamp_ns in stamps_ns]
+        noted[node] = {"stamps_ns": stamps_ns, "offsets_ns": offsets_ns}
+    return json.dumps(noted)
+
+
+def noted_curves(metadata: Mapping[str, str], name: str) -> dict[str, ClockCurve]:
+    """Return the curves that a dive was solved with; empty for none. name: the log's, for an error."""
+    try:
+        told = json.loads(metadata.get(CURVES, "{}"))
+        return {node: ClockCurve.of(one["stamps_ns"], one["offsets_ns"]) for node, one in told.items()}
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
+        raise BuddylineError(f"{name}: its metadata {CURVES} cannot be read ({error})") from error

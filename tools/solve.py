@@ -24,7 +24,7 @@ from buddyline.solver_service.config import SolveConfig, node_ids, track_setting
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.pair_core import PairCore
 from buddyline.tools.authenticity import AUTHENTICITY, check_logs
-from buddyline.tools.clock_curves import chosen_curves
+from buddyline.tools.clock_curves import CURVES, chosen_curves, curves_text
 from buddyline.tools.dives import Dive, load_info
 from buddyline.tools.newfile import new_dive_log
 from buddyline.tools.option_values import node_files
@@ -57,10 +57,11 @@ def run(args: argparse.Namespace) -> int:
             raise ConfigError("--clock-offset and --clocks are of one pair; choose it with --nodes A B")
         # Nodes of lamps alone, or of a camera alone, are in the network, and in no pair.
         lone = [node for node, info in infos.items() if not _is_full(info) and (node in nodes or not args.nodes)]
+        curves = chosen_curves(dive, nodes, args.clock_offset, args.clocks)
         core = SolverCore(
             settings,
             [pair for pair in combinations(nodes, 2) if all(_is_full(infos[node]) for node in pair)],
-            chosen_curves(dive, nodes, args.clock_offset, args.clocks),
+            curves,
             track=track_settings(args.track, args.track_hz),
             lone=lone,
         )
@@ -69,6 +70,8 @@ def run(args: argparse.Namespace) -> int:
         metadata = dive.metadata() | {"command": "solve", "method": args.method, "checks": args.checks}
         told = check_logs(dive.readers, args.authority)
         metadata |= {AUTHENTICITY: "; ".join(told)} if told else {}
+        # A solved dive that is solved again may name the curves of before.
+        metadata |= {CURVES: curves_text(curves)} if curves or CURVES in metadata else {}
         with new_dive_log(args.output, metadata) as writer:
             for info in replaced.values():
                 core.handle(info)

@@ -66,7 +66,7 @@ def _triggers(world: World, plan: DivePlan, end_ns: int) -> Iterator[int]:
 
 
 def _truth(world: World, plan: DivePlan, end_ns: int) -> Iterator[Entry]:
-    """Yield the truth at the nominal instant of every trigger, also where its frames are lost."""
+    """Yield the truth at the stamp of every trigger's nominal instant, also where its frames are lost."""
     nodes = world.scenario.nodes
     pairs = list(combinations(nodes, 2))
     for trigger in _triggers(world, plan, end_ns):

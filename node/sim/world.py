@@ -1,8 +1,8 @@
 """The simulated world of nodes: a function of (scenario, node, time).
 
 Two processes with the same Scenario see the same world, at any time and in any order.
-Stamps are on the given node's own clock (all but A's are off by Scenario.clock_offset_ns). Stamps of the truth are on
-A's.
+Stamps are on the given node's own clock (all but the first node's are off by Scenario.clock_offset_ns). A pair's truth
+is stamped midway between both nodes' clocks, as poses and tracks are; the nodes' true poses by the first node's clock.
 """
 
 from __future__ import annotations
@@ -104,9 +104,10 @@ class World:
         return round(max(-5.0, min(5.0, float(rng.standard_normal()))) * self.scenario.stamp_sigma_ns)
 
     def truth(self, stamp_ns: int, trigger: int, pair: tuple[str, str] | None = None) -> Truth:
-        """Return a pair's true T_a_b at stamp_ns on A's clock; pair: None for the first two nodes."""
-        t_s = self._seconds(0, stamp_ns)
-        a, b = (self._scene.motion.placement(self.scenario.index(n), t_s) for n in pair or self.scenario.nodes[:2])
+        """Return a pair's true T_a_b at stamp_ns, midway between their clocks; pair: None for the first two nodes."""
+        of_a, of_b = (self.scenario.index(node) for node in pair or self.scenario.nodes[:2])
+        t_s = self._seconds_between(of_a, of_b, stamp_ns)
+        a, b = (self._scene.motion.placement(index, t_s) for index in (of_a, of_b))
         R_camera_a_ned = (a.R_ned_body @ R_BODY_CAMERA).T
         t_a_b_m = R_camera_a_ned @ (b.position_ned_m - a.position_ned_m)
         R_a_b = R_camera_a_ned @ b.R_ned_body @ R_BODY_CAMERA
@@ -118,7 +119,7 @@ class World:
         )
 
     def node_truth(self, node: str, stamp_ns: int, net: str) -> NodePose:
-        """Return a node's true pose in NED, with its origin at the surface, at stamp_ns on A's clock."""
+        """Return a node's true pose in NED, with its origin at the surface, at stamp_ns on the first node's clock."""
         index, t_s = self.scenario.index(node), self._seconds(0, stamp_ns)
         before, now, after = (self._scene.motion.placement(index, t_s + step) for step in (-STEP_S, 0.0, STEP_S))
         return NodePose(
@@ -213,10 +214,14 @@ class World:
 
     def _seconds(self, index: int, stamp_ns: int) -> float:
         """Return seconds since the start for a stamp on a node's clock."""
-        if index == 0:
-            return (stamp_ns - self.scenario.start_ns) * 1e-9
-        own_s = (stamp_ns - self.scenario.clock_offset_ns - self.scenario.start_ns) * 1e-9
-        return own_s / (1.0 + self.scenario.clock_drift)
+        return self._seconds_between(index, index, stamp_ns)
+
+    def _seconds_between(self, one: int, other: int, stamp_ns: int) -> float:
+        """Return seconds since the start for a stamp midway between two nodes' clocks."""
+        share = 0.5 * ((one > 0) + (other > 0))
+        offset_ns = round(share * self.scenario.clock_offset_ns)
+        own_s = (stamp_ns - offset_ns - self.scenario.start_ns) * 1e-9
+        return own_s / (1.0 + share * self.scenario.clock_drift)
 
     def _merged(self, index: int, left: Lamp, right: Lamp) -> bool:
         """Return whether the clipped cores of two lights overlap."""

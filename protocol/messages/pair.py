@@ -40,7 +40,9 @@ class RelativePose(Message, frozen=True, kw_only=True):
 
     covariance: 6x6 row-major, position in A's camera frame (m), then the small rotation w (rad) with
     R_true = exp(w) R_a_b, in A's camera frame. blobs_a: [left, right] of B's lights, as indices into A's
-    Candidates (-1: that light was not seen); blobs_b likewise. skew_ns: stamp_a - stamp_b.
+    Candidates (-1: that light was not seen); blobs_b likewise. stamp_ns: mean of both pictures' stamps, so midway
+    between both nodes' clocks; skew_ns: stamp_a - stamp_b. A solver that is told how the clocks differ has taken both
+    stamps onto the first node's clock before.
     With attitude only: t_ned_m, azimuth_rad (from north, clockwise), inclination_rad (up positive), and their sigmas
     (1 sd), which count the error of A's attitude as well as the pose's.
     heading_gap_rad: with both attitudes, what is to be added to B's heading for both to agree with the pose.
@@ -81,6 +83,7 @@ class RelativePose(Message, frozen=True, kw_only=True):
 class Track(Message, frozen=True, kw_only=True):
     """The fused estimate of T_a_b at stamp_ns, also between triggers.
 
+    stamp_ns: midway between both nodes' clocks, as in RelativePose, also where the track has found how they differ.
     covariance: 6x6 row-major as in RelativePose. v_a_b_mps: velocity of B's camera relative to A's, in A's camera
     frame, without the part that comes from A's rotation; v_covariance: 3x3 row-major. lights: number of lights used
     at the last trigger before stamp_ns. age_s: time since a light was last used. With attitude only: t_ned_m and the
@@ -123,7 +126,7 @@ class Rejected(Message, frozen=True, kw_only=True):
 
 
 class Truth(Message, frozen=True, kw_only=True):
-    """True T_a_b of a simulated or surveyed dive."""
+    """True T_a_b of a simulated or surveyed dive. stamp_ns: midway between both nodes' clocks."""
 
     stamp_ns: StampNs
     t_a_b_m: Vector3

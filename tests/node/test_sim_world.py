@@ -16,6 +16,7 @@ from buddyline.protocol.blinking import lit
 from buddyline.protocol.codec import decode, encode
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CameraModel, Candidates
+from msgspec.structs import replace
 
 S_NS = 1_000_000_000
 START_NS = 1_764_000_000 * S_NS
@@ -122,13 +123,19 @@ def test_truth_follows_from_both_poses_in_ned():
 
 
 def test_true_poses_in_ned_are_those_of_the_pair_also_with_clocks_apart():
-    world = World(Scenario(seed=2, start_ns=START_NS, clock_offset_ns=S_NS))
-    stamp_ns = START_NS + 3 * S_NS
-    a, b = (world.node_truth(node, stamp_ns, "main") for node in "ab")
-    R_ned_a = rotation.from_quaternion(a.q_xyzw)
-    truth = world.truth(stamp_ns, 0)
-    np.testing.assert_allclose(truth.t_a_b_m, R_ned_a.T @ np.subtract(b.p_m, a.p_m), atol=1e-12)
-    later = world.node_truth("b", stamp_ns + S_NS // 100, "main")
+    drift = 1e-4
+    world = World(Scenario(seed=2, start_ns=START_NS, more_nodes=("c",), clock_offset_ns=S_NS, clock_drift=drift))
+    since_ns = 3 * S_NS
+    poses = {node: world.node_truth(node, START_NS + since_ns, "main") for node in "abc"}
+    for pair, clocks_ahead in (("ab", 0.5), ("bc", 1.0)):
+        # Midway between the pair's clocks.
+        stamp_ns = START_NS + since_ns + round(clocks_ahead * (S_NS + drift * since_ns))
+        a, b = (poses[node] for node in pair)
+        R_ned_a = rotation.from_quaternion(a.q_xyzw)
+        truth = world.truth(stamp_ns, 0, (pair[0], pair[1]))
+        np.testing.assert_allclose(truth.t_a_b_m, R_ned_a.T @ np.subtract(b.p_m, a.p_m), atol=1e-7)
+    b = poses["b"]
+    later = world.node_truth("b", b.stamp_ns + S_NS // 100, "main")
     np.testing.assert_allclose(later.p_m, np.add(b.p_m, np.array(b.v_mps) / 100), atol=1e-3)
 
 
@@ -279,11 +286,11 @@ def test_a_magnetometer_that_is_off_turns_the_heading_and_nothing_else():
         np.testing.assert_allclose(R_off @ R.T, rotation.from_euler(0, 0, expected), atol=1e-12)
 
 
-def test_a_clock_offset_shifts_what_b_sees_and_not_the_truth():
+def test_a_clock_offset_shifts_what_b_sees_and_the_truth_by_half():
     offset_ns = 50_000_000
     good, off = World(Scenario(seed=1)), World(Scenario(seed=1, clock_offset_ns=offset_ns))
     stamp_ns = 9 * S_NS
-    assert good.truth(stamp_ns, 0) == off.truth(stamp_ns, 0)
+    assert good.truth(stamp_ns, 0) == replace(off.truth(stamp_ns + offset_ns // 2, 0), stamp_ns=stamp_ns)
     assert good.light_truth("a", stamp_ns, 0) == off.light_truth("a", stamp_ns, 0)
     shifted = off.light_truth("b", stamp_ns + offset_ns, 0)
     assert shifted.lights == good.light_truth("b", stamp_ns, 0).lights

@@ -33,7 +33,9 @@ from buddyline.protocol.topics import (
     TRUTH,
     Topic,
 )
+from buddyline.tools.clock_curves import noted_curves
 from buddyline.tools.dives import Dive, open_each
+from buddyline.tools.evaluation.clocks import take_onto_common_clock
 from buddyline.tools.evaluation.recorded import Recorded
 from buddyline.tools.evaluation.truth import inverted
 from buddyline.tools.pairs import Pair, pair_words, wanted_pair
@@ -104,7 +106,8 @@ def load(paths: Sequence[str], truth_paths: Sequence[str] = (), pair: Pair | Non
     """Read one pair's messages.
 
     Poses, rejections and tracks are those of the first listed log with poses or rejections. Truth is taken only from
-    truth_paths if they have it. Candidates and NodeInfo come in the order of the listed logs.
+    truth_paths if they have it. Candidates and NodeInfo come in the order of the listed logs. All is on the clock of
+    the poses: midway between both nodes' clocks, or on the first node's where the dive was solved with clocks known.
     """
     with ExitStack() as stack:
         logs = open_each(paths, stack)
@@ -126,6 +129,8 @@ def load(paths: Sequence[str], truth_paths: Sequence[str] = (), pair: Pair | Non
             for envelope in log.messages(*(topic.name for topic in topics), doing=f"read {log.name}"):
                 _take(recorded, envelope.ids, envelope.message)
             recorded.doubled += log.repeated.get("/".join(recorded.nodes), 0)
+        for log in answering[:1]:
+            take_onto_common_clock(recorded, noted_curves(log.metadata(), log.name))
     return recorded
 
 

@@ -1,0 +1,76 @@
+"""`simulate`, `solve` and `evaluate` of dives whose nodes' clocks differ agree with each other."""
+
+import json
+
+import numpy as np
+import pytest
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.errors import BuddylineError
+from buddyline.solver_service.clock_curve import ClockCurve
+from buddyline.tools.cli import main
+from buddyline.tools.clock_curves import CURVES, curves_text, noted_curves
+
+OFFSET_MS, DRIFT_PPM = 300.0, 100.0
+
+
+@pytest.fixture(scope="module")
+def dive(tmp_path_factory):
+    """A dive of which B's clock is far ahead, and gains."""
+    path = tmp_path_factory.mktemp("clocks_apart") / "dive.mcap"
+    words = ["--seconds", "30", "--seed", "8", "--imu", "--inertial", "poor"]
+    clocks = ["--clock-offset-ms", str(OFFSET_MS), "--clock-drift-ppm", str(DRIFT_PPM)]
+    assert main(["simulate", str(path), *words, *clocks]) == 0
+    return path
+
+
+def evaluated(dive, out, capsys, *words):
+    assert main(["solve", str(dive), "-o", str(out), *words]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", str(out), "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def check_track(result):
+    [track] = result["tracks"]
+    assert track["samples"] > 1400
+    assert track["wrong"] == 0
+    assert 0.7 < track["nees6"]["mean"] / 6.0 < 1.4
+    assert track["position_m"]["median"] < 0.01
+
+
+def test_a_track_that_found_the_clocks_itself_is_right(dive, tmp_path, capsys):
+    check_track(evaluated(dive, tmp_path / "out.mcap", capsys))
+
+
+@pytest.mark.parametrize("drifts", [False, True])
+def test_poses_and_track_of_a_dive_solved_with_its_clocks_are_right(dive, tmp_path, capsys, drifts):
+    words = ["--clock-offset", "0.3015"]
+    if drifts:
+        (tmp_path / "clocks.json").write_text(
+            json.dumps({"node_a": "a", "node_b": "b", "offset_s": 0.3, "drift": 1e-4, "at_ns": 1_764_000_000 * S_NS})
+        )
+        words = ["--clocks", str(tmp_path / "clocks.json")]
+    result = evaluated(dive, tmp_path / "out.mcap", capsys, *words)
+    check_track(result)
+    assert result["accuracy"]["poses"] > 200
+    assert result["accuracy"]["wrong"] == 0
+    assert result["accuracy"]["nees6"]["mean"] / 6.0 < 1.4
+    # The poses' candidates are found again, though B's triggers were numbered anew.
+    assert result["pairing"]["right_share"] > 0.6
+
+
+def test_a_curve_of_many_points_is_noted_by_some_of_them():
+    stamps_ns = np.arange(0, 3600 * S_NS, S_NS)
+    curve = ClockCurve(stamps_ns, (1e-4 * stamps_ns).astype(np.int64))
+    text = curves_text({"b": curve, "c": ClockCurve.constant(-0.5)})
+    assert len(text) < 10_000
+    noted = noted_curves({CURVES: text}, "dive.mcap")
+    assert noted["c"].offset_ns(5 * S_NS) == -S_NS // 2
+    at_ns = [0, 1_234_567_891_234, 3599 * S_NS]
+    assert [noted["b"].offset_ns(one) for one in at_ns] == pytest.approx([curve.offset_ns(one) for one in at_ns], abs=2)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"b": 1}', '{"b": {"stamps_ns": [], "offsets_ns": []}}', '{"b": {}}'])
+def test_a_note_that_does_not_fit_is_named(text):
+    with pytest.raises(BuddylineError, match=r"dive\.mcap: its metadata clock_curves"):
+        noted_curves({CURVES: text}, "dive.mcap")
