@@ -9,6 +9,8 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.solver_service.clock_curve import ClockCurve
 from buddyline.tools.cli import main
 from buddyline.tools.clock_curves import CURVES, curves_text, noted_curves
+from buddyline.tools.dives import Dive
+from buddyline.tools.monitor.summary import summarize
 
 OFFSET_MS, DRIFT_PPM = 300.0, 100.0
 
@@ -57,6 +59,11 @@ def test_poses_and_track_of_a_dive_solved_with_its_clocks_are_right(dive, tmp_pa
     assert result["accuracy"]["nees6"]["mean"] / 6.0 < 1.4
     # The poses' candidates are found again, though B's triggers were numbered anew.
     assert result["pairing"]["right_share"] > 0.6
+    with Dive([tmp_path / "out.mcap"]) as solved:
+        summary = summarize(solved, ("a", "b"))
+    assert summary.errors().wrong.sum() == 0
+    [track] = summary.track_figures()
+    assert track.position_m.median < 0.01
 
 
 def test_a_curve_of_many_points_is_noted_by_some_of_them():

@@ -10,6 +10,7 @@ from buddyline.protocol.messages import Attitude, Candidates, LightTruth, Truth
 from buddyline.solver_service.clock_curve import ClockCurve
 from buddyline.tools.evaluation.recorded import Recorded
 from buddyline.tools.evaluation.truth import CLOSE_NS
+from buddyline.tools.pairs import Pair
 from msgspec import UNSET
 from msgspec.structs import replace
 
@@ -17,13 +18,10 @@ OfNode = TypeVar("OfNode", Attitude, Candidates, LightTruth)
 
 
 def take_onto_common_clock(recorded: Recorded, curves: Mapping[str, ClockCurve]) -> None:
-    """Move stamps, and number triggers anew, as the solver did with these curves. Results stay as they are.
-
-    A truth is midway between both nodes' clocks: it is moved by half of what each of them is moved by.
-    """
+    """Move stamps, and number triggers anew, as the solver did with these curves. Results stay as they are."""
     if not any(node in curves for node in recorded.nodes):
         return
-    recorded.truths = [_truth_moved(truth, recorded, curves) for truth in recorded.truths]
+    recorded.truths = [truth_moved(truth, recorded.nodes, curves) for truth in recorded.truths]
     recorded.candidates = [_moved(one, recorded, curves) for one in recorded.candidates]
     recorded.light_truths = [_moved(one, recorded, curves) for one in recorded.light_truths]
     recorded.attitudes_a = [_moved(one, recorded, curves) for one in recorded.attitudes_a]
@@ -39,8 +37,9 @@ def _moved(message: OfNode, recorded: Recorded, curves: Mapping[str, ClockCurve]
     return replace(message, stamp_ns=stamp_ns, trigger=trigger_index(stamp_ns, info.trigger_period_ns))
 
 
-def _truth_moved(truth: Truth, recorded: Recorded, curves: Mapping[str, ClockCurve]) -> Truth:
-    offsets_ns = [curves[node].offset_ns(truth.stamp_ns) for node in recorded.nodes if node in curves]
+def truth_moved(truth: Truth, pair: Pair, curves: Mapping[str, ClockCurve]) -> Truth:
+    """Move a truth, midway between both nodes' clocks, by half of what each of the two is moved by."""
+    offsets_ns = [curves[node].offset_ns(truth.stamp_ns) for node in pair if node in curves]
     stamp_ns = max(truth.stamp_ns - sum(offsets_ns) // 2, 0)
     # Where it is moved far, the trigger of that number is another one.
     far = abs(stamp_ns - truth.stamp_ns) > CLOSE_NS

@@ -10,8 +10,10 @@ from typing import Final
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.health import TRACK_SIGMA_SHARE
 from buddyline.protocol.messages import Candidates, Depth, NodeInfo, Rejected, RelativePose, Track, Truth
+from buddyline.tools.clock_curves import noted_curves
 from buddyline.tools.dives import Dive
 from buddyline.tools.estimate import Estimate, sigma_m
+from buddyline.tools.evaluation.clocks import truth_moved
 from buddyline.tools.evaluation.poses import PoseErrors, pose_errors
 from buddyline.tools.evaluation.tracks import TrackFigures, covered_share, tracks_figures
 from buddyline.tools.evaluation.truth import TruthTrack, inverted
@@ -100,6 +102,7 @@ def summarize(dive: Dive, pair: Pair | None) -> Summary:
     summary = Summary(PairPicture(pair), Coverage(dive.start_ns, dive.end_ns), spacing_ns)
     lit_before_ns: int | None = None
     counted: set[int] = set()
+    curves = noted_curves(dive.metadata(), dive.name)
     for envelope in dive.messages(*TOPICS):
         message, at_ns = envelope.message, envelope.time_ns
         # A message is in each recording that was running, and in the node's own log.
@@ -108,8 +111,9 @@ def summarize(dive: Dive, pair: Pair | None) -> Summary:
             counted.add(identity)
             summary.counts[envelope.key] += 1
         if isinstance(message, Truth):
-            if pair in (envelope.ids, envelope.ids[::-1]):
-                summary.truths.append(message if envelope.ids == pair else inverted(message))
+            if pair is not None and pair in (envelope.ids, envelope.ids[::-1]):
+                truth = message if envelope.ids == pair else inverted(message)
+                summary.truths.append(truth_moved(truth, pair, curves))
             continue
         summary.picture.take(envelope)
         if isinstance(message, RelativePose | Rejected):
