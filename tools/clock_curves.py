@@ -219,3 +219,16 @@ def noted_curves(metadata: Mapping[str, str], name: str) -> dict[str, ClockCurve
         return {node: ClockCurve.of(one["stamps_ns"], one["offsets_ns"]) for node, one in told.items()}
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
         raise BuddylineError(f"{name}: its metadata {CURVES} cannot be read ({error})") from error
+
+
+def apart_problem(pair: tuple[str, str], offset_s: float, curves: Mapping[str, ClockCurve], at_ns: int) -> str:
+    """Say that a pair's clocks differ though curves were taken into account, what it does to poses, and what to do."""
+    node_a, node_b = pair
+    known_ns = [curves[node].offset_ns(at_ns) if node in curves else 0 for node in pair]
+    whole_s = offset_s + (known_ns[1] - known_ns[0]) / S_NS
+    ahead = "ahead of" if offset_s > 0.0 else "behind"
+    return (
+        f"clock of {node_b} is {1e3 * abs(offset_s):.0f} ms {ahead} {node_a}'s: each pose is of pictures taken that "
+        "far apart, and off by what the nodes moved meanwhile, which its sigmas do not count (the track's do); "
+        f"solve again with --nodes {node_a} {node_b} --clock-offset {whole_s:.4f} (align tells a drift too)"
+    )

@@ -18,13 +18,15 @@ from buddyline.protocol.config import ConfigError, load_config
 from buddyline.protocol.divelog import DiveLogWriter
 from buddyline.protocol.envelope import Envelope
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.messages import CompressedImage, FixedPlace, Message, NodeInfo, NodePose, Track
+from buddyline.protocol.health import CLOCKS_APART_S
+from buddyline.protocol.messages import CompressedImage, FixedPlace, Message, NodeInfo, NodePose, SolverStatus, Track
 from buddyline.protocol.topics import TRACK
+from buddyline.solver_service.clock_curve import ClockCurve
 from buddyline.solver_service.config import SolveConfig, node_ids, track_settings
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.pair_core import PairCore
 from buddyline.tools.authenticity import AUTHENTICITY, check_logs
-from buddyline.tools.clock_curves import CURVES, chosen_curves, curves_text
+from buddyline.tools.clock_curves import CURVES, apart_problem, chosen_curves, curves_text
 from buddyline.tools.dives import Dive, load_info
 from buddyline.tools.newfile import new_dive_log
 from buddyline.tools.option_values import node_files
@@ -37,6 +39,8 @@ log = logging.getLogger(__name__)
 TOGETHER: Final = 2048
 # Half a trigger period at 10 Hz. An offset with a larger sd (1 sd) does not tell which pictures were taken together.
 CLOCK_KNOWN_S: Final = 0.05
+# Clocks are named as apart where the track's offset is above CLOCKS_APART_S, and above this many of its sigmas.
+CLOCK_SIGMAS: Final = 4.0
 # A track whose rows are further apart is told in parts.
 PART_S: Final = 1.0
 # The inputs that the output has beside the poses, so that it can be evaluated and solved again without other logs.
@@ -95,13 +99,37 @@ def run(args: argparse.Namespace) -> int:
                 # What the whole dive told: counts, the clocks' offset, problems. There is no diver left to advise.
                 problems = core.health.of_dive(pair.nodes)
                 status = pair.report(dive.end_ns, dive.end_ns, problems, bad, sorted(core.unused), over=True)
-                writer.write_message(replace(status, advice=UNSET), dive.end_ns)
-    _summarize(args, core, tracks, bad, time.monotonic() - began_s)
+                writer.write_message(_of_dive(status, pair), dive.end_ns)
+            problems_of = {nodes: _track_problems(pair, curves, dive) for nodes, pair in core.pairs.items()}
+    _summarize(args, core, tracks, problems_of, bad, time.monotonic() - began_s)
     if not core.counts.total():
         log.error("no trigger was resolved: the dive holds no candidates of %s", " or ".join(nodes))
     elif not core.matched:
         log.error("nodes %s have no trigger in common: are the logs of the same dive?", " and ".join(nodes))
     return 0 if core.matched else 1
+
+
+def _of_dive(status: SolverStatus, pair: PairCore) -> SolverStatus:
+    """Return a pair's status with what the whole dive tells of the clocks, and without advice."""
+    offset_s = _clocks_apart_s(pair)
+    return replace(status, advice=UNSET, clock_skew_s=status.clock_skew_s if offset_s is None else offset_s)
+
+
+def _clocks_apart_s(pair: PairCore) -> float | None:
+    """Return B's clock minus A's as the track found it, None where they agree or it does not tell."""
+    clock = pair.tracker.clock_now() if pair.tracker is not None else None
+    if clock is None or not clock[1] <= CLOCK_KNOWN_S:
+        return None
+    return clock[0] if abs(clock[0]) > max(CLOCKS_APART_S, CLOCK_SIGMAS * clock[1]) else None
+
+
+def _track_problems(pair: PairCore, curves: Mapping[str, ClockCurve], dive: Dive) -> list[str]:
+    """Return the problems that a pair's track has told, and found in the dive."""
+    offset_s = _clocks_apart_s(pair)
+    problems = [*pair.tracker.problems] if pair.tracker is not None else []
+    if offset_s is not None:
+        problems.append(apart_problem(pair.nodes, offset_s, curves, (dive.start_ns + dive.end_ns) // 2))
+    return problems
 
 
 def _is_full(info: NodeInfo) -> bool:
@@ -278,7 +306,12 @@ def _write(writer: DiveLogWriter, results: Iterable[Message], tracks: dict[tuple
 
 
 def _summarize(
-    args: argparse.Namespace, core: SolverCore, tracks: Mapping[tuple[str, ...], Tracked], bad: int, took_s: float
+    args: argparse.Namespace,
+    core: SolverCore,
+    tracks: Mapping[tuple[str, ...], Tracked],
+    problems_of: Mapping[tuple[str, str], list[str]],
+    bad: int,
+    took_s: float,
 ) -> None:
     of_pairs = [one for pair in core.pairs for one in core.health.of_dive(pair)]
     # Nodes of lamps alone, or of a camera alone, are in no pair.
@@ -288,7 +321,7 @@ def _summarize(
         log.warning("network: %s", problem)
     told = {ids[1:]: of for ids, of in sorted(tracks.items()) if len(ids) == 3}
     for pair in core.pairs.values():
-        for problem in pair.tracker.problems if pair.tracker is not None else ():
+        for problem in problems_of[pair.nodes]:
             log.warning("track of %s and %s: %s", *pair.nodes, problem)
     if args.json:
         pairs = [
@@ -299,7 +332,7 @@ def _summarize(
                 "matched": pair.matcher.matched,
                 "solved": pair.counts["solved"],
                 "rejected": _rejected(pair.counts),
-                "track": _track_figures(pair, tracks),
+                "track": _track_figures(pair, tracks, problems_of[pair.nodes]),
             }
             for pair in core.pairs.values()
         ]
@@ -345,7 +378,9 @@ def _rejected(counts: Counter[str]) -> dict[str, int]:
     return {reason: count for reason, count in sorted(counts.items()) if reason != "solved"}
 
 
-def _track_figures(pair: PairCore, tracks: Mapping[tuple[str, ...], Tracked]) -> dict[str, object] | None:
+def _track_figures(
+    pair: PairCore, tracks: Mapping[tuple[str, ...], Tracked], problems: list[str]
+) -> dict[str, object] | None:
     """Return the track's figures, None where none was asked for."""
     if pair.tracker is None:
         return None
@@ -356,7 +391,7 @@ def _track_figures(pair: PairCore, tracks: Mapping[tuple[str, ...], Tracked]) ->
         "longest_gap_s": told.longest_gap_s,
         "clock_offset_s": clock and clock[0],
         "clock_sigma_s": clock and clock[1],
-        "problems": pair.tracker.problems,
+        "problems": problems,
     }
 
 

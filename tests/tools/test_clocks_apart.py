@@ -1,6 +1,7 @@
 """`simulate`, `solve` and `evaluate` of dives whose nodes' clocks differ agree with each other."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -8,10 +9,11 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
 from buddyline.solver_service.clock_curve import ClockCurve
 from buddyline.tools.cli import main
-from buddyline.tools.clock_curves import CURVES, curves_text, noted_curves
+from buddyline.tools.clock_curves import CURVES, apart_problem, curves_text, noted_curves
 from buddyline.tools.dives import Dive
 from buddyline.tools.monitor.summary import summarize
 
+START_NS = 1_764_000_000 * S_NS
 OFFSET_MS, DRIFT_PPM = 300.0, 100.0
 
 
@@ -25,11 +27,12 @@ def dive(tmp_path_factory):
     return path
 
 
-def evaluated(dive, out, capsys, *words):
+def evaluated(dive, out, capsys, caplog, *words):
+    """Return what `evaluate` tells of a dive, and what it and `solve` warn of."""
     assert main(["solve", str(dive), "-o", str(out), *words]) == 0
     capsys.readouterr()
     assert main(["evaluate", str(out), "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
+    return json.loads(capsys.readouterr().out), [record.getMessage() for record in caplog.records]
 
 
 def check_track(result):
@@ -40,19 +43,29 @@ def check_track(result):
     assert track["position_m"]["median"] < 0.01
 
 
-def test_a_track_that_found_the_clocks_itself_is_right(dive, tmp_path, capsys):
-    check_track(evaluated(dive, tmp_path / "out.mcap", capsys))
+def test_a_track_that_found_the_clocks_itself_is_right(dive, tmp_path, capsys, caplog):
+    result, warnings = evaluated(dive, tmp_path / "out.mcap", capsys, caplog)
+    check_track(result)
+    # The poses are wrong by more than they state. Both commands say so, and what to do.
+    assert result["accuracy"]["nees6"]["mean"] / 6.0 > 3.0
+    assert len(warnings) == 2
+    for warning in warnings:
+        [ms] = re.findall(r"clock of b is (\d+) ms ahead of a's", warning)
+        [s] = re.findall(r"solve again with --nodes a b --clock-offset (0\.\d{4}) ", warning)
+        assert float(ms) == pytest.approx(301.5, abs=6.0)
+        assert float(s) == pytest.approx(0.3015, abs=0.006)
 
 
 @pytest.mark.parametrize("drifts", [False, True])
-def test_poses_and_track_of_a_dive_solved_with_its_clocks_are_right(dive, tmp_path, capsys, drifts):
+def test_poses_and_track_of_a_dive_solved_with_its_clocks_are_right(dive, tmp_path, capsys, caplog, drifts):
     words = ["--clock-offset", "0.3015"]
     if drifts:
         (tmp_path / "clocks.json").write_text(
-            json.dumps({"node_a": "a", "node_b": "b", "offset_s": 0.3, "drift": 1e-4, "at_ns": 1_764_000_000 * S_NS})
+            json.dumps({"node_a": "a", "node_b": "b", "offset_s": 0.3, "drift": 1e-4, "at_ns": START_NS})
         )
         words = ["--clocks", str(tmp_path / "clocks.json")]
-    result = evaluated(dive, tmp_path / "out.mcap", capsys, *words)
+    result, warnings = evaluated(dive, tmp_path / "out.mcap", capsys, caplog, *words)
+    assert not any("ahead of" in warning for warning in warnings)
     check_track(result)
     assert result["accuracy"]["poses"] > 200
     assert result["accuracy"]["wrong"] == 0
@@ -64,6 +77,14 @@ def test_poses_and_track_of_a_dive_solved_with_its_clocks_are_right(dive, tmp_pa
     assert summary.errors().wrong.sum() == 0
     [track] = summary.track_figures()
     assert track.position_m.median < 0.01
+
+
+def test_what_is_still_apart_is_added_to_what_was_taken_into_account():
+    curves = {"b": ClockCurve.constant(0.3), "c": ClockCurve.constant(-0.1)}
+    told = apart_problem(("a", "b"), -0.02, curves, START_NS)
+    assert "clock of b is 20 ms behind a's" in told
+    assert "--nodes a b --clock-offset 0.2800 " in told
+    assert "--nodes b c --clock-offset -0.3500 " in apart_problem(("b", "c"), 0.05, curves, START_NS)
 
 
 def test_a_curve_of_many_points_is_noted_by_some_of_them():

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from typing import Final
 
 from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.health import CLOCKS_APART_S
 from buddyline.protocol.messages import (
     Attitude,
     Candidates,
@@ -16,6 +17,7 @@ from buddyline.protocol.messages import (
     NodePose,
     Rejected,
     RelativePose,
+    SolverStatus,
     Track,
     Truth,
 )
@@ -28,17 +30,20 @@ from buddyline.protocol.topics import (
     NET_TRUTH,
     POSE,
     REJECTED,
+    SOLVER_STATUS,
     TRACK,
     TRACK_LAG,
     TRUTH,
     Topic,
 )
-from buddyline.tools.clock_curves import noted_curves
+from buddyline.solver_service.clock_curve import ClockCurve
+from buddyline.tools.clock_curves import apart_problem, noted_curves
 from buddyline.tools.dives import Dive, open_each
 from buddyline.tools.evaluation.clocks import take_onto_common_clock
 from buddyline.tools.evaluation.recorded import Recorded
 from buddyline.tools.evaluation.truth import inverted
 from buddyline.tools.pairs import Pair, pair_words, wanted_pair
+from msgspec import UNSET
 
 _RESULTS: Final = (POSE, REJECTED)
 # Used where a log has no results of the solver: poses from tags are evaluated in the same way.
@@ -102,6 +107,15 @@ def _take(recorded: Recorded, ids: tuple[str, ...], message: Message) -> None:
         getattr(recorded, _LISTS[type(message)]).append(message)
 
 
+def _clocks_apart(log: Dive, pair: Pair, curves: Mapping[str, ClockCurve]) -> list[str]:
+    """Return a line where the last status of a pair's solver says that the clocks differ."""
+    told = [one.message for one in log.messages(SOLVER_STATUS.name) if one.ids == pair]
+    last = told[-1] if told else None
+    if not isinstance(last, SolverStatus) or last.clock_skew_s is UNSET or abs(last.clock_skew_s) <= CLOCKS_APART_S:
+        return []
+    return [f"{log.name}: {apart_problem(pair, last.clock_skew_s, curves, last.stamp_ns)}"]
+
+
 def load(paths: Sequence[str], truth_paths: Sequence[str] = (), pair: Pair | None = None) -> Recorded:
     """Read one pair's messages.
 
@@ -130,7 +144,9 @@ def load(paths: Sequence[str], truth_paths: Sequence[str] = (), pair: Pair | Non
                 _take(recorded, envelope.ids, envelope.message)
             recorded.doubled += log.repeated.get("/".join(recorded.nodes), 0)
         for log in answering[:1]:
-            take_onto_common_clock(recorded, noted_curves(log.metadata(), log.name))
+            curves = noted_curves(log.metadata(), log.name)
+            take_onto_common_clock(recorded, curves)
+            recorded.problems += _clocks_apart(log, recorded.nodes, curves)
     return recorded
 
 
