@@ -5,12 +5,18 @@ import re
 
 import numpy as np
 import pytest
+from buddyline.node.sim.scenario import Scenario
+from buddyline.node.sim.world import World
 from buddyline.protocol.clock import S_NS
+from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
 from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import Candidates, LightTruth, NodeInfo, RelativePose, Truth
 from buddyline.solver_service.clock_curve import ClockCurve
 from buddyline.tools.cli import main
 from buddyline.tools.clock_curves import CURVES, apart_problem, curves_text, noted_curves
 from buddyline.tools.dives import Dive
+from buddyline.tools.evaluation.clocks import SimulatedClocks, take_ned_truths
+from buddyline.tools.evaluation.recorded import Recorded
 from buddyline.tools.monitor.summary import summarize
 
 START_NS = 1_764_000_000 * S_NS
@@ -85,6 +91,40 @@ def test_what_is_still_apart_is_added_to_what_was_taken_into_account():
     assert "clock of b is 20 ms behind a's" in told
     assert "--nodes a b --clock-offset 0.2800 " in told
     assert "--nodes b c --clock-offset -0.3500 " in apart_problem(("b", "c"), 0.05, curves, START_NS)
+
+
+@pytest.mark.parametrize(
+    ("pair", "curves_s", "ahead_a_s", "between_s"),
+    [
+        (("a", "b"), {}, 0.0, 0.151),
+        (("a", "b"), {"b": 0.3}, 0.0, 0.001),
+        (("b", "c"), {}, 0.302, 0.302),
+        (("b", "c"), {"b": 0.3, "c": 0.302}, 0.002, 0.001),
+    ],
+)
+def test_a_node_s_true_poses_are_taken_from_the_first_node_s_clock(pair, curves_s, ahead_a_s, between_s):
+    clocks = SimulatedClocks.of(
+        {"start_ns": str(START_NS), "clock_offset_ns": str(round(0.3 * S_NS)), "clock_drift": "0.0001"}
+    )
+    at_ns = START_NS + 20 * S_NS
+    true = World(Scenario(start_ns=START_NS)).node_truth("a", at_ns, "main")
+    recorded = Recorded(pair, ned_truths_a=[true])
+    take_ned_truths(recorded, clocks, {node: ClockCurve.constant(s) for node, s in curves_s.items()})
+    assert [one.stamp_ns - at_ns for one in recorded.ned_truths_a] == [round(ahead_a_s * S_NS)]
+    assert [one.stamp_ns - at_ns for one in recorded.ned_truths_between] == [round(between_s * S_NS)]
+    assert recorded.ned_truths_between[0].q_xyzw == true.q_xyzw
+
+
+def test_clocks_that_a_log_notes_wrongly_are_named(dive, tmp_path, capsys):
+    with DiveLogReader(dive) as reader, DiveLogWriter(tmp_path / "odd.mcap", metadata={"clock_drift": "x"}) as writer:
+        for record in reader.records():
+            one = record.open()
+            if isinstance(one.message, Truth | RelativePose | LightTruth | Candidates | NodeInfo):
+                writer.write_message(one.message, key=one.key)
+    assert main(["solve", str(tmp_path / "odd.mcap"), "-o", str(tmp_path / "out.mcap"), "--track", "none"]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", str(tmp_path / "out.mcap")]) == 2
+    assert "out.mcap: its metadata of the simulated clocks" in capsys.readouterr().err
 
 
 def test_a_curve_of_many_points_is_noted_by_some_of_them():

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TypeVar
+from dataclasses import dataclass
+from typing import Self, TypeVar
 
 from buddyline.protocol.clock import trigger_index
-from buddyline.protocol.messages import Attitude, Candidates, LightTruth, Truth
+from buddyline.protocol.messages import Attitude, Candidates, LightTruth, NodePose, Truth
 from buddyline.solver_service.clock_curve import ClockCurve
 from buddyline.tools.evaluation.recorded import Recorded
 from buddyline.tools.evaluation.truth import CLOSE_NS
@@ -15,6 +16,45 @@ from msgspec import UNSET
 from msgspec.structs import replace
 
 OfNode = TypeVar("OfNode", Attitude, Candidates, LightTruth)
+
+
+@dataclass(frozen=True)
+class SimulatedClocks:
+    """The clocks of a simulated dive: all but the first node's are ahead, by offset_ns at the start, and gain drift."""
+
+    first: str = "a"
+    start_ns: int = 0
+    offset_ns: int = 0
+    drift: float = 0.0
+
+    @classmethod
+    def of(cls, metadata: Mapping[str, str]) -> Self:
+        """Return those that `simulate` has noted; all agree where it has not."""
+        return cls(
+            metadata.get("node_a", "a"),
+            int(metadata.get("start_ns", "0")),
+            int(metadata.get("clock_offset_ns", "0")),
+            float(metadata.get("clock_drift", "0")),
+        )
+
+    def ahead_ns(self, node: str, stamp_ns: int) -> int:
+        """Return a node's clock minus the first node's, at a stamp of the first node's."""
+        return 0 if node == self.first else self.offset_ns + round(self.drift * (stamp_ns - self.start_ns))
+
+
+def take_ned_truths(recorded: Recorded, clocks: SimulatedClocks, curves: Mapping[str, ClockCurve]) -> None:
+    """Take A's true poses, of the first node's clock, onto A's clock for poses, and between both nodes' for tracks.
+
+    curves: with which the dive was solved.
+    """
+
+    def moved(truth: NodePose, nodes: tuple[str, ...]) -> NodePose:
+        offsets_ns = [clocks.ahead_ns(node, truth.stamp_ns) for node in nodes]
+        offsets_ns += [-curves[node].offset_ns(truth.stamp_ns) for node in nodes if node in curves]
+        return replace(truth, stamp_ns=max(truth.stamp_ns + sum(offsets_ns) // len(nodes), 0))
+
+    recorded.ned_truths_between = [moved(truth, recorded.nodes) for truth in recorded.ned_truths_a]
+    recorded.ned_truths_a = [moved(truth, recorded.nodes[:1]) for truth in recorded.ned_truths_a]
 
 
 def take_onto_common_clock(recorded: Recorded, curves: Mapping[str, ClockCurve]) -> None:

@@ -39,7 +39,7 @@ from buddyline.protocol.topics import (
 from buddyline.solver_service.clock_curve import ClockCurve
 from buddyline.tools.clock_curves import apart_problem, noted_curves
 from buddyline.tools.dives import Dive, open_each
-from buddyline.tools.evaluation.clocks import take_onto_common_clock
+from buddyline.tools.evaluation.clocks import SimulatedClocks, take_ned_truths, take_onto_common_clock
 from buddyline.tools.evaluation.recorded import Recorded
 from buddyline.tools.evaluation.truth import inverted
 from buddyline.tools.pairs import Pair, pair_words, wanted_pair
@@ -107,6 +107,19 @@ def _take(recorded: Recorded, ids: tuple[str, ...], message: Message) -> None:
         getattr(recorded, _LISTS[type(message)]).append(message)
 
 
+def _simulated_clocks(logs: Sequence[Dive]) -> SimulatedClocks:
+    for log in logs:
+        try:
+            found = SimulatedClocks.of(log.metadata())
+        except ValueError as error:
+            raise BuddylineError(
+                f"{log.name}: its metadata of the simulated clocks cannot be read ({error})"
+            ) from error
+        if found.offset_ns or found.drift:
+            return found
+    return SimulatedClocks()
+
+
 def _clocks_apart(log: Dive, pair: Pair, curves: Mapping[str, ClockCurve]) -> list[str]:
     """Return a line where the last status of a pair's solver says that the clocks differ."""
     told = [one.message for one in log.messages(SOLVER_STATUS.name) if one.ids == pair]
@@ -145,6 +158,7 @@ def load(paths: Sequence[str], truth_paths: Sequence[str] = (), pair: Pair | Non
             recorded.doubled += log.repeated.get("/".join(recorded.nodes), 0)
         for log in answering[:1]:
             curves = noted_curves(log.metadata(), log.name)
+            take_ned_truths(recorded, _simulated_clocks([*logs, *truth_logs]), curves)
             take_onto_common_clock(recorded, curves)
             recorded.problems += _clocks_apart(log, recorded.nodes, curves)
     return recorded

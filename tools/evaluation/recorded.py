@@ -22,7 +22,8 @@ from buddyline.tools.pairs import Pair
 class Recorded:
     """One pair's messages. truths are of T_a_b, also if the log has T_b_a.
 
-    nodes: a and b. ned_truths_a: node a's true poses in NED, for azimuth and inclination. attitudes_a: its attitudes,
+    nodes: a and b. ned_truths_a: node a's true poses in NED, by a's clock, for azimuth and inclination.
+    ned_truths_between: the same, stamped as the tracks are; None where that is the same. attitudes_a: its attitudes,
     used if there are no true poses. problems: lines for a person. doubled: number of second outcomes of a trigger that
     were left out. environment: the water, if a log names it.
     """
@@ -36,6 +37,7 @@ class Recorded:
     tracks: list[Track] = field(default_factory=list)
     attitudes_a: list[Attitude] = field(default_factory=list)
     ned_truths_a: list[NodePose] = field(default_factory=list)
+    ned_truths_between: list[NodePose] | None = None
     infos: dict[str, NodeInfo] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     doubled: int = 0

@@ -135,6 +135,7 @@ def evaluate(recorded: Recorded) -> Result:
     )
     # Sigmas in NED are compared only with true poses: a comparison by attitudes would not contain their errors.
     true_ned_a = ned_of_camera(recorded.ned_truths_a, [], None)
+    between = recorded.ned_truths_a if recorded.ned_truths_between is None else recorded.ned_truths_between
     compared = [(pose, known[0]) for pose in poses if (known := track.at(pose.stamp_ns, pose.trigger)) is not None]
     seen = visible_triggers(nodes, poses, rejected, lights, blobs, set(errors.trigger[errors.wrong].tolist()))
     return Result(
@@ -150,7 +151,13 @@ def evaluate(recorded: Recorded) -> Result:
         bins=_bins(errors, seen),
         pairing=pairing_figures(seen),
         detection=detection_figures(lights, blobs),
-        tracks=tracks_figures(recorded.tracks, poses, track, true_ned_a, _triggers_ns(frames.values(), rejected)),
+        tracks=tracks_figures(
+            recorded.tracks,
+            poses,
+            track,
+            ned_of_camera(between, [], None),
+            _triggers_ns(frames.values(), rejected),
+        ),
         errors=errors,
         environment=recorded.environment,
         ned=ned_honesty(compared, true_ned_a),
