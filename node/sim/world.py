@@ -2,7 +2,7 @@
 
 Two processes with the same Scenario see the same world, at any time and in any order.
 Stamps are on the given node's own clock (all but the first node's are off by Scenario.clock_offset_ns). A pair's truth
-is stamped midway between both nodes' clocks, as poses and tracks are; the nodes' true poses by the first node's clock.
+is stamped midway between both nodes' clocks, as poses and tracks are.
 """
 
 from __future__ import annotations
@@ -119,8 +119,9 @@ class World:
         )
 
     def node_truth(self, node: str, stamp_ns: int, net: str) -> NodePose:
-        """Return a node's true pose in NED, with its origin at the surface, at stamp_ns on the first node's clock."""
-        index, t_s = self.scenario.index(node), self._seconds(0, stamp_ns)
+        """Return a node's true pose in NED, with its origin at the surface, at stamp_ns on its clock."""
+        index = self.scenario.index(node)
+        t_s = self._seconds(index, stamp_ns)
         before, now, after = (self._scene.motion.placement(index, t_s + step) for step in (-STEP_S, 0.0, STEP_S))
         return NodePose(
             net=net,

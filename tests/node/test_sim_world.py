@@ -126,10 +126,14 @@ def test_true_poses_in_ned_are_those_of_the_pair_also_with_clocks_apart():
     drift = 1e-4
     world = World(Scenario(seed=2, start_ns=START_NS, more_nodes=("c",), clock_offset_ns=S_NS, clock_drift=drift))
     since_ns = 3 * S_NS
-    poses = {node: world.node_truth(node, START_NS + since_ns, "main") for node in "abc"}
-    for pair, clocks_ahead in (("ab", 0.5), ("bc", 1.0)):
+    ahead_ns = round(S_NS + drift * since_ns)
+    # Each by its own clock, at one instant.
+    poses = {
+        node: world.node_truth(node, START_NS + since_ns + (0 if node == "a" else ahead_ns), "main") for node in "abc"
+    }
+    for pair in ("ab", "bc"):
         # Midway between the pair's clocks.
-        stamp_ns = START_NS + since_ns + round(clocks_ahead * (S_NS + drift * since_ns))
+        stamp_ns = sum(poses[node].stamp_ns for node in pair) // 2
         a, b = (poses[node] for node in pair)
         R_ned_a = rotation.from_quaternion(a.q_xyzw)
         truth = world.truth(stamp_ns, 0, (pair[0], pair[1]))

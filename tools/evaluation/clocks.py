@@ -43,13 +43,14 @@ class SimulatedClocks:
 
 
 def take_ned_truths(recorded: Recorded, clocks: SimulatedClocks, curves: Mapping[str, ClockCurve]) -> None:
-    """Take A's true poses, of the first node's clock, onto A's clock for poses, and between both nodes' for tracks.
+    """Take A's true poses onto the clock that A's stamps were solved on, and for tracks between both nodes' clocks.
 
     curves: with which the dive was solved.
     """
 
     def moved(truth: NodePose, nodes: tuple[str, ...]) -> NodePose:
-        offsets_ns = [clocks.ahead_ns(node, truth.stamp_ns) for node in nodes]
+        own_ns = clocks.ahead_ns(truth.node, truth.stamp_ns)
+        offsets_ns = [clocks.ahead_ns(node, truth.stamp_ns) - own_ns for node in nodes]
         offsets_ns += [-curves[node].offset_ns(truth.stamp_ns) for node in nodes if node in curves]
         return replace(truth, stamp_ns=max(truth.stamp_ns + sum(offsets_ns) // len(nodes), 0))
 

@@ -12,11 +12,13 @@ import numpy as np
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NodePose
 from buddyline.protocol.topics import NET_POSE, NET_TRUTH, POSE, REJECTED
+from buddyline.tools.clock_curves import noted_curves
 from buddyline.tools.dives import first_with_net, open_each
 from buddyline.tools.evaluation.rotation import conjugate, multiply, normalized, rotation_vector
 from buddyline.tools.evaluation.statistics import Stats
 from buddyline.tools.evaluation.truth import PoseHistory
 from buddyline.tools.measure.tables import number, text_table
+from msgspec.structs import replace
 
 # A node's pose is wrong where it is off by more than this, and by more than WRONG_SIGMAS.
 WRONG_M: Final = 0.3
@@ -114,16 +116,22 @@ def _figures(
 
 
 def load_network(paths: Sequence[str], truth_paths: Sequence[str]) -> tuple[list[NodePose], list[NodePose]]:
-    """Read the poses of all nodes, of the first log that has any, and their truth; raise BuddylineError for none."""
+    """Read the poses of all nodes, of the first log that has any, and their truth; raise BuddylineError for none.
+
+    Each node's poses and truth are by its own clock; the truth is moved by the curves that the dive was solved with.
+    """
     with ExitStack() as stack:
         logs, truth_logs = open_each(paths, stack), open_each(truth_paths, stack)
         solved = first_with_net(logs)
         poses = list(solved.all_of(NET_POSE, NodePose))
+        curves = noted_curves(solved.metadata(), solved.name)
         truths = [one for log in [*truth_logs, *logs] for one in log.all_of(NET_TRUTH, NodePose)]
     if not truths:
         named = ", ".join([*paths, *truth_paths])
         raise BuddylineError(f"{named}: no truth of the net's nodes; name its log with --truth T.mcap")
-    return poses, truths
+    offsets_ns = [curves[one.node].offset_ns(one.stamp_ns) if one.node in curves else 0 for one in truths]
+    moved = [replace(one, stamp_ns=max(one.stamp_ns - ns, 0)) for one, ns in zip(truths, offsets_ns, strict=True)]
+    return poses, moved
 
 
 def shows_network(paths: Sequence[str]) -> bool:
