@@ -13,7 +13,7 @@ from tests.net_figures import WALKED, told
 
 
 def sigmas():
-    return state.LEVER_TOLD_M, shaking.SHAKE_RAD, Samples().noise(0.0).gyro_bias_radps
+    return state.LEVER_TOLD_M, float(np.exp(0.5 * shaking._FIRST[0])), Samples().noise(0.0).gyro_bias_radps
 
 
 @pytest.mark.parametrize("name", GRADES)
@@ -22,7 +22,7 @@ def test_the_simulators_own_sigmas_are_told_and_taken_back(name):
     grade = GRADES[name]
     with told(grade):
         shaken_rad = shake_rad if grade.shake_radps else 1e-6
-        assert sigmas() == (grade.lever_sigma_m, shaken_rad, WALKED * grade.gyro_walk_radps)
+        assert sigmas() == pytest.approx((grade.lever_sigma_m, shaken_rad, WALKED * grade.gyro_walk_radps))
     assert lever_m != grade.lever_sigma_m
     assert sigmas() == before
 

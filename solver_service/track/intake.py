@@ -187,8 +187,11 @@ class TrackIntake:
             elif len(samples) and not (len(samples.last(t_s + SILENT_S, 2.0 * SILENT_S)) or self.gone(node, t_s)):
                 self._problems.report(f"node {name}: inertial samples are missing: the track does without them", t_s)
             if samples.rejected > self._rejected[node]:
-                which = f"node {name}: {samples.rejected} inertial samples so far are left out"
-                self._problems.report(f"{which}: not finite, clipped, sent twice or far from their neighbours", t_s)
+                said = (
+                    f"node {name}: {samples.rejected} inertial samples so far are left out: "
+                    "not finite, clipped, sent twice or far from their neighbours"
+                )
+                self._problems.report(said, t_s)
                 self._rejected[node] = samples.rejected
 
     def _compare_gyros(self, t_s: float) -> None:

@@ -78,7 +78,7 @@ def test_a_vehicle_on_a_real_hub_reaches_autopilot_plotter_and_program() -> None
         (("--http", "127.0.0.1:8", "--place", "95,1"), "--place 95,1"),
         (("--http", "127.0.0.1:8", "--reference", "b"), "is the vehicle itself"),
         (("--http", "127.0.0.1:8", "--reference", "a", "--net", "main"), "--reference and --net"),
-        (("--http", "127.0.0.1:8", "--rate", "nan"), "--rate nan"),
+        (("--http", "127.0.0.1:8", "--rate", "-1"), "--rate -1"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(
