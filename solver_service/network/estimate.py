@@ -20,7 +20,7 @@ from buddyline.solver_service.network.sights import SightArrays, columns, light_
 from buddyline.solver_service.network.state import BLOCK, P_, PHI, V_, block, lone
 from buddyline.solver_service.network.trail import Present, Told
 from buddyline.solver_service.track import anchors
-from buddyline.solver_service.track.association import Odds, doubts_of, odds_of
+from buddyline.solver_service.track.association import Odds, doubt_of, odds_of
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.intake import TrackIntake, newest_before
 from buddyline.solver_service.track.lights import Sight, alike, in_picture, pixel_of, residuals, with_stamp
@@ -225,8 +225,8 @@ class NetEstimate(NetBelief):
             self.members[bar.observer].looks_away = False
         counted = variances * [self._alike(bars[bar], candidate, of) for bar, candidate, of, _ in chosen]
         noise = noise_of(counted, H[n, k, light, :, -1], np.array([id(bars[one].sight) for one in n]))
-        sigma_px = np.array([bars[bar].sight.sigma_px[candidate] for bar, candidate, *_ in chosen])
-        doubts = np.repeat(doubts_of(variances, sigma_px), 2)
+        sigma_px = [float(bars[bar].sight.sigma_px[candidate]) for bar, candidate, *_ in chosen]
+        doubts = np.repeat([doubt_of(one, sigma) for one, sigma in zip(variances.tolist(), sigma_px, strict=True)], 2)
         self._apply(rows.reshape(2 * len(chosen), -1), y[n, k, light].ravel(), noise, doubts)
 
     def _alike(self, bar: Bar, k: int, light: int) -> float:

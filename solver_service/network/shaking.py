@@ -53,7 +53,7 @@ class NetShaking:
         """Return it with one more member. told (2,): the logs of its variances by an earlier pass, None where nothing
         is known of it."""
         n = len(self.logs)
-        information = nothing_learned(2 * n + 2)
+        information = nothing_learned(2 * n + 2).copy()
         information[:, : 2 * n, : 2 * n] = self.information
         first = _FIRST if told is None else told
         more = np.zeros((1, 2, MOVING, MOVING))

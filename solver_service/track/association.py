@@ -145,14 +145,14 @@ def variance_of(sigma_px: float, common: float, gross: float) -> float:
     return sigma_px**2 + added_px2
 
 
-def doubts_of(variances: Floats, sigma_px: Floats) -> Floats:
-    """Give what the variances (N,) of lights have beside sigma_px^2 for a gross error that each hardly has, px^2.
+def doubt_of(variance: float, sigma_px: float) -> float:
+    """Give what the variance of a light has beside sigma_px^2 for a gross error that it hardly has, px^2.
 
     The mixture's variance makes a residual that is large look like an expected one. That is right where a light moves
     an estimate. But how large residuals are is not to be learned so: of what is Gaussian, the tails would not count.
     """
-    added_px2 = np.maximum(variances - sigma_px * sigma_px, 0.0)
-    return np.where(added_px2 < 0.5 * GROSS_PX**2, added_px2, 0.0)
+    added_px2 = variance - sigma_px * sigma_px
+    return added_px2 if 0.0 < added_px2 < 0.5 * GROSS_PX**2 else 0.0
 
 
 def odds_of(y: Floats, H: Floats, P: Floats, sigma_px: Floats, clutter_per_px2: Floats) -> list[Odds]:

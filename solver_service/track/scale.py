@@ -75,10 +75,10 @@ def scaled(rig: Rig, share: float) -> Rig:
 
 
 def by_scale(H: Floats, state: State, other: int, lights_m: Floats) -> Floats:
-    """Give h (2 N,) of lights: H (N, 2, C) by COLUMNS, lights_m (N, 3) of the node other than the observer."""
+    """Give h (2 N,) of lights: H (2 N, SIZE), lights_m (N, 3) of the node other than the observer."""
     # What moves a light by a share of its arm is what would move the node by that.
     arms = 0.5 * lights_m @ state.R[other].T
-    return np.asarray((H[..., R_] @ arms[..., None])[..., 0].ravel())
+    return np.asarray((H[:, R_].reshape(-1, 2, 3) @ arms[:, :, None]).ravel())
 
 
 def with_gap(P: Floats, share: float, U: Floats, state: State) -> Floats:

@@ -11,7 +11,7 @@ import numpy as np
 from buddyline.solver_service.geometry.observation import STAMP_SIGMA_S
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track import anchors
-from buddyline.solver_service.track.association import LIKELY, SURE, Association, Odds, associate, doubts_of, odds_of
+from buddyline.solver_service.track.association import LIKELY, SURE, Association, Odds, associate, doubt_of, odds_of
 from buddyline.solver_service.track.estimate import REFLECTED_S, Estimate
 from buddyline.solver_service.track.inputs import TrackNode
 from buddyline.solver_service.track.lights import (
@@ -252,9 +252,9 @@ class TrackSights(TrackMoves):
         rows_H, rows_y, noise = light_rows(found.chosen, y, H)
         more = counted_more(found.chosen, used)
         doubts = doubted(found.chosen, sight) if estimate.confirmed else np.zeros(len(rows_y))
-        k, light, _ = map(list, zip(*found.chosen, strict=True))
         other = 1 - sight.node
-        stretched = by_scale(H[k, light], estimate.state, other, self.nodes[other].rig.lights_m[light])
+        lights_m = self.nodes[other].rig.lights_m[[light for _, light, _ in found.chosen]]
+        stretched = by_scale(rows_H, estimate.state, other, lights_m)
         error, chi2 = told_by(estimate, rows_H, rows_y, noise, more, doubts, stretched)
         estimate.state = estimate.state.plus(error)
         estimate.lasted += 2 * sum(float(sight.lasting_s[k]) > 0.0 for k, *_ in found.chosen)
@@ -386,9 +386,9 @@ def counted_more(chosen: Chosen, used: Chosen) -> Floats:
 
 
 def doubted(chosen: Chosen, sight: Sight) -> Floats:
-    """Give what the variances of lights (2 N,) have for doubts, by `doubts_of`."""
-    k, _, variances = map(np.array, zip(*chosen, strict=True))
-    return np.repeat(doubts_of(variances, sight.sigma_px[k]), 2)
+    """Give what the variances of lights (2 N,) have for doubts, by `doubt_of`."""
+    sigma_px = sight.sigma_px.tolist()
+    return np.array([doubt_of(variance, sigma_px[k]) for k, _, variance in chosen for _ in (0, 1)])
 
 
 def note_lit(estimate: Estimate, sight: Sight, used: Chosen) -> None:

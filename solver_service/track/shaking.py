@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -29,10 +30,40 @@ MOST: Final = np.log(np.array((0.03, 0.03, 0.3)) ** 2)
 # A picture's weight is halved after 200 more, which two nodes take in 10 s at 10 Hz: shaking comes and goes.
 KEPT: Final = 0.5 ** (1.0 / 200.0)
 LONGEST_STEP: Final = 0.5
+_SHORTEST: Final = math.exp(-LONGEST_STEP)
 # One residual's chi^2 counts at most so much: gross errors are no shaking.
 MOST_CHI2: Final = 9.0
 # So much of the shaking is taken to be left at least where a share of the samples' fast part is taken off.
 LEAST_LEFT: Final = 0.2
+
+
+@cache
+def nothing_learned(count: int) -> Floats:
+    """Give the information (2, count, count) of variances whose first values alone are known; not to be changed."""
+    information = np.tile(0.5 * FIRST * np.eye(count), (2, 1, 1))
+    information.flags.writeable = False
+    return information
+
+
+def learned(
+    logs: Floats, information: Floats, slope: Floats, fisher: Floats, first_logs: Floats, kept: float
+) -> tuple[Floats, Floats]:
+    """Go on by the likelihood's slope (n,) and its information (n, n), both by the logs (n,) of variances.
+
+    information (2, n, n): what has been learned of the logs, and of the variances as shares of the first ones; kept: so
+    much of it counts on. What a calm time tells of the logs is little, so that shaking which begins is believed at
+    once, but by the logs it would be believed for long after it has ended. By the variances it is the other way round.
+    The longer step is taken.
+    """
+    share = np.exp(logs - first_logs)
+    both, slopes = np.empty_like(information), np.empty((2, len(logs), 1))
+    both[0], both[1] = fisher, fisher / (share[:, None] * share)
+    slopes[0, :, 0], slopes[1, :, 0] = slope, slope / share
+    information = kept * information + both + (1.0 - kept) * nothing_learned(len(logs))
+    by_logs, by_shares = np.linalg.solve(information, slopes)[..., 0]
+    by_shares = np.log(np.maximum(1.0 + by_shares / share, _SHORTEST))
+    step = np.where(np.abs(by_shares) > np.abs(by_logs), by_shares, by_logs)
+    return logs + np.minimum(np.maximum(step, -LONGEST_STEP), LONGEST_STEP), information
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,30 +101,6 @@ class Shaking:
         fisher = 0.5 * (W.reshape(3, -1) @ np.swapaxes(W, 1, 2).reshape(3, -1).T)
         logs, information = learned(self.logs, self.information, slope, fisher, FIRST_LOGS, KEPT)
         return Shaking(np.minimum(np.maximum(logs, LEAST), MOST), information)
-
-
-def nothing_learned(count: int) -> Floats:
-    """Give the information (2, count, count) of variances of which only the first values are known."""
-    return np.tile(0.5 * FIRST * np.eye(count), (2, 1, 1))
-
-
-def learned(
-    logs: Floats, information: Floats, slope: Floats, fisher: Floats, first_logs: Floats, kept: float
-) -> tuple[Floats, Floats]:
-    """Go on by the likelihood's slope (n,) and its information (n, n), both by the logs (n,) of variances.
-
-    information (2, n, n): what has been learned of the logs, and of the variances as shares of the first ones; kept: so
-    much of it counts on. What a calm time tells of the logs is little, so that shaking which begins is believed at
-    once, but by the logs it would be believed for long after it has ended. By the variances it is the other way round.
-    The longer step is taken.
-    """
-    share = np.exp(logs - first_logs)
-    both = np.stack((fisher, fisher / np.outer(share, share)))
-    information = kept * information + both + (1.0 - kept) * nothing_learned(len(logs))
-    by_logs, by_shares = np.linalg.solve(information, np.stack((slope, slope / share))[..., None])[..., 0]
-    by_shares = np.log(np.maximum(1.0 + by_shares / share, math.exp(-LONGEST_STEP)))
-    step = np.where(np.abs(by_shares) > np.abs(by_logs), by_shares, by_logs)
-    return logs + np.minimum(np.maximum(step, -LONGEST_STEP), LONGEST_STEP), information
 
 
 def kept_share(span_s: float | Floats) -> Floats:

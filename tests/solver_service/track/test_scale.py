@@ -13,6 +13,7 @@ from buddyline.solver_service.track.lights import light_positions, residuals
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.records import NodeRecord, last_ns
 from buddyline.solver_service.track.scale import ScaleGap, by_scale, scaled, with_gap
+from buddyline.solver_service.track.seeing import light_rows
 from buddyline.solver_service.track.state import NAV
 
 from tests.solver_service.track.dives import KnownDive, Setting, filter_of, make, score
@@ -46,7 +47,8 @@ def test_by_scale_is_what_lights_further_from_their_camera_do(observer: int) -> 
     tangents = np.tile(900.0 * np.eye(3)[:2], (2, 1, 1)) @ (np.eye(3) - bearings[:, :, None] * bearings[:, None, :])
     y, H = residuals(bearings, tangents, X, D)
     k = [0, 1]
-    h = by_scale(H[k, k], state, 1 - observer, lights_m)
+    rows_H, *_ = light_rows(((0, 0, 1.0), (1, 1, 1.0)), y, H)
+    h = by_scale(rows_H, state, 1 - observer, lights_m)
     share, sign = 1e-5, (1.0 if observer == 0 else -1.0)
     longer, _ = light_positions(state, observer, (1.0 + 0.5 * sign * share) * lights_m, np.zeros((2, 3)), np.zeros(1))
     moved, _ = residuals(bearings, tangents, longer, D)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from buddyline.solver_service.geometry.evidence import GROSS_PX
 from buddyline.solver_service.geometry.rotation import Floats
-from buddyline.solver_service.track.association import associate, doubts_of, variance_of
+from buddyline.solver_service.track.association import associate, doubt_of, variance_of
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.state import NAV, PHI
 
@@ -37,7 +37,7 @@ def learned(
         )
         if seen.chosen:
             variances = np.array([variance for *_, variance in seen.chosen])
-            noise_px2 = variances if censored else variances - doubts_of(variances, sigma_px)
+            noise_px2 = variances - (0.0 if censored else doubt_of(variances[0], SIGMA_PX))
             S_inverse = np.linalg.inv(H @ parts[0] @ H.T + noise_px2 * np.eye(2))
             shaking = shaking.taught(y, S_inverse, H, parts)
         found[n] = np.sqrt(shaking.variances[0])
@@ -66,7 +66,7 @@ def test_shaking_that_begins_or_ends_is_believed_soon(seed: int) -> None:
 
 
 def test_what_is_rather_a_gross_error_tells_nothing_of_shaking() -> None:
-    sigma_px = np.array((0.7, 0.7, 0.5, 0.5))
-    variances = np.array([variance_of(s, 1.0 - g, g) for s, g in zip(sigma_px, (0.0, 0.2, 0.4, 0.9), strict=True)])
-    doubts = doubts_of(variances, sigma_px)
-    np.testing.assert_allclose(variances - doubts, (0.49, 0.49, 0.25, 0.25 + 0.9 * GROSS_PX**2))
+    for sigma_px, gross, left_px2 in ((0.7, 0.0, 0.49), (0.7, 0.2, 0.49), (0.5, 0.4, 0.25), (0.5, 0.9, 44.35)):
+        variance = variance_of(sigma_px, 1.0 - gross, gross)
+        assert variance - doubt_of(variance, sigma_px) == pytest.approx(left_px2)
+        assert variance == pytest.approx(sigma_px**2 + gross * GROSS_PX**2)
