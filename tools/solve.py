@@ -41,6 +41,8 @@ TOGETHER: Final = 2048
 CLOCK_KNOWN_S: Final = 0.05
 # Clocks are named as apart where the track's offset is above CLOCKS_APART_S, and above this many of its sigmas.
 CLOCK_SIGMAS: Final = 4.0
+# A track of single lamps may be wrong about its clocks: an offset is advised where it is known this well, 1 sd.
+ADVISED_SIGMA_S: Final = 0.01
 # A track whose rows are further apart is told in parts.
 PART_S: Final = 1.0
 # The inputs that the output has beside the poses, so that it can be evaluated and solved again without other logs.
@@ -118,7 +120,7 @@ def _of_dive(status: SolverStatus, pair: PairCore) -> SolverStatus:
 def _clocks_apart_s(pair: PairCore) -> float | None:
     """Return B's clock minus A's as the track found it, None where they agree or it does not tell."""
     clock = pair.tracker.clock_now() if pair.tracker is not None else None
-    if clock is None or not clock[1] <= CLOCK_KNOWN_S:
+    if clock is None or not clock[1] <= ADVISED_SIGMA_S:
         return None
     return clock[0] if abs(clock[0]) > max(CLOCKS_APART_S, CLOCK_SIGMAS * clock[1]) else None
 

@@ -143,7 +143,8 @@ def _of_bars(
         if left_ns:
             first, parts, clock_ns = _rounds(records, fixes, clock_ns + left_ns)
     between_bars = reduce(ScaleGap.plus, [part.scale for part in parts], ScaleGap())
-    if closes and (between_bars.found or (gap and between_bars.sigmas > GAP_LEFT_SIGMAS)):
+    # A clock that jumps is no bar.
+    if closes and not in_pieces(parts) and (between_bars.found or (gap and between_bars.sigmas > GAP_LEFT_SIGMAS)):
         return between_bars.share
     if not parts:
         return Smoothed([], clock_ns * 1e-9, math.inf, first.problems)

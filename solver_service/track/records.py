@@ -21,7 +21,7 @@ from buddyline.solver_service.track.inputs import (
     Stamps,
     TrackNode,
 )
-from buddyline.solver_service.track.intake import BEYOND, TrackIntake
+from buddyline.solver_service.track.intake import TrackIntake
 from buddyline.solver_service.track.samples import false_ones, sound_ones
 from buddyline.solver_service.track.stepping import TrackSteps
 from buddyline.solver_service.track.units import clipped, stuck_runs, stuck_words
@@ -148,8 +148,10 @@ def judged(record: NodeRecord) -> NodeRecord:
         return replace(record, faults=faults)
     epoch_ns = int(stamps_ns[0])
     with np.errstate(invalid="ignore"):
-        sound = (np.abs(record.gyro_radps) < BEYOND).all(axis=1) & ~clipped(record.gyro_radps)
+        values = np.hstack((record.accel_mps2, record.gyro_radps))
+        sound = sound_ones(values) & ~clipped(record.gyro_radps)
     sound[1:] &= np.diff(stamps_ns) > 0
+    sound[sound] = ~false_ones(np.asarray(stamps_ns[sound] - epoch_ns, np.float64) * 1e-9, values[sound])
     told = TurningTold(
         np.asarray(attitudes.stamps_ns - epoch_ns, np.float64) * 1e-9,
         attitudes.R_ned_body,

@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 # Further apart, and what lies between two samples is not told.
 GAP_S: Final = 0.06
 # A sample further than this from both its neighbours, in any axis of force (m/s^2) or rate (rad/s), is false: a torn or
-# a wrong reading. Divers, shaken housings and noise stay below a tenth of it from one sample to the next at 100 Hz.
-FALSE_MPS2: Final = 5.0
-FALSE_RADPS: Final = 0.5
+# a wrong reading. Divers, shaken housings and noise stay below a tenth of it from one sample to the next at 100 Hz. So
+# does one that is further than so many times what the last true ones were apart, in the middle.
+FALSE: Final[Floats] = np.repeat((5.0, 0.5), 3)
+FALSE_TIMES: Final = 8.0
+_LAST_ONES: Final = 33
 # Over so long shaking has no mean to speak of, and motion changes little.
 SLOW_S: Final = 0.4
 _NOISE_SPAN_S: Final = 2.0
@@ -42,31 +44,38 @@ def sound_ones(values: Floats) -> Bools:
     return np.asarray(np.isfinite(values).all(1) & (np.abs(values) < 1e4).all(1))
 
 
-def false_ones(times_s: Floats, values: Floats) -> Bools:
+def false_ones(times_s: Floats, values: Floats, known: int = 1) -> Bools:
     """Tell which samples (N,), (N, 6), sound and in order of time, are false: jumps that later ones do not follow.
 
     Nothing later is looked at than the sample itself. One that is near both false ones just before it, or comes more
-    than GAP_S after the last true one, is true. So is the first.
+    than GAP_S after the last true one, is true. So are the first `known` ones.
     """
-    out, k = np.zeros(len(times_s), dtype=bool), 0
-    jumps = _apart(values[1:], values[:-1]) | (np.diff(times_s) <= 0.0)
+    out, k = np.zeros(len(times_s), dtype=bool), known - 1
+    jumps = _apart(values[1:], values[:-1], FALSE) | (np.diff(times_s) <= 0.0)
     for true in np.flatnonzero(jumps).tolist():
         # Those before k have been judged already.
         if true < k:
             continue
+        first = max(true + 1 - 4 * _LAST_ONES, 0)
+        last_ones = values[first : true + 1][~out[first : true + 1]][-_LAST_ONES:]
+        limits = FALSE
+        if len(last_ones) > _LAST_ONES // 2:
+            typical = np.median(np.abs(np.diff(last_ones, axis=0)), axis=0).reshape(2, 3).max(axis=1)
+            limits = np.maximum(FALSE, np.repeat(FALSE_TIMES * typical, 3))
         k = true + 1
-        while k < len(out) and times_s[k] - times_s[true] < GAP_S and _apart(values[k], values[true]):
-            if k > true + 2 and not jumps[k - 2 : k].any():
+        while k < len(out) and times_s[k] - times_s[true] < GAP_S and _apart(values[k], values[true], limits):
+            last = slice(k - 2, k + 1)
+            lasts = k > true + 2 and (np.diff(times_s[last]) > 0.0).all()
+            if lasts and not _apart(values[last][1:], values[last][:-1], limits).any():
                 break
             out[k] = True
             k += 1
     return out
 
 
-def _apart(one: Floats, other: Floats) -> Bools:
-    """Whether samples (..., 6) are further from each other than neighbours are."""
-    off = np.abs(one - other)
-    return np.asarray((off[..., :3].max(-1) > FALSE_MPS2) | (off[..., 3:].max(-1) > FALSE_RADPS))
+def _apart(one: Floats, other: Floats, limits: Floats) -> Bools:
+    """Whether samples (..., 6) are further from each other than limits (6,) in any axis."""
+    return np.asarray((np.abs(one - other) > limits).any(axis=-1))
 
 
 class Samples:
@@ -140,10 +149,11 @@ class Samples:
 
     def _judged(self, times_s: Floats, values: Floats) -> Bools:
         """Tell which of these samples (N,), (N, 6), which come after all others, are false."""
-        one = slice(max(self._count - 1, 0), self._count)
+        one = slice(max(self._count - _LAST_ONES, 0), self._count)
         times_s = np.concatenate((self._t[one], self._false[0], times_s))
         values = np.concatenate((self._values[one, :6], self._false[1], values))
-        false, count = false_ones(times_s, values), len(self._t[one]) + len(self._false[0])
+        known = max(one.stop - one.start, 1)
+        false, count = false_ones(times_s, values, known), one.stop - one.start + len(self._false[0])
         last = 1 + int(np.flatnonzero(~false)[-1])
         self._false = times_s[last:], values[last:]
         return false[count:]

@@ -254,7 +254,11 @@ class TrackSights(TrackMoves):
         doubts = doubted(found.chosen, sight) if estimate.confirmed else np.zeros(len(rows_y))
         other = 1 - sight.node
         lights_m = self.nodes[other].rig.lights_m[[light for _, light, _ in found.chosen]]
-        stretched = by_scale(rows_H, estimate.state, other, lights_m)
+        # Where motion is guessed, errors that last are not counted in the noise, and a gap must not be made of them.
+        apart_s = sight.t_s - float(estimate.lit_s[sight.node].max())
+        lasting_s = max(float(sight.lasting_s[k]) for k, *_ in found.chosen)
+        own = 1.0 / alike(lasting_s, apart_s) if any(estimate.without) else 1.0
+        stretched = by_scale(rows_H, estimate.state, other, lights_m), own
         error, chi2 = told_by(estimate, rows_H, rows_y, noise, more, doubts, stretched)
         estimate.state = estimate.state.plus(error)
         estimate.lasted += 2 * sum(float(sight.lasting_s[k]) > 0.0 for k, *_ in found.chosen)
@@ -278,15 +282,16 @@ def told_by(
     noise: Floats,
     more: Floats | None = None,
     doubts: Floats | None = None,
-    stretched: Floats | None = None,
+    stretched: tuple[Floats, float] | None = None,
     *,
     others: int = 0,
 ) -> tuple[Floats, float]:
     """Update all but an estimate's state; give the error (SIZE,) to add to that, and chi^2 of the residuals y (m,).
 
     more (m,): by how much variances count more than they are, in all but chi^2. doubts (m,): of lights, which teach
-    shaking and shares: what their variances have for doubts that shaking does not share. stretched (m,): of lights, h
-    as `scale.by_scale` gives it. others: how many rows, the first ones, are not of lights.
+    shaking and shares: what their variances have for doubts that shaking does not share. stretched: of lights, h (m,)
+    as `scale.by_scale` gives it, and how much of a picture of its own this one is. others: how many rows, the first
+    ones, are not of lights.
     """
     before = estimate.covariance
     if more is None or not more.any():
@@ -302,8 +307,8 @@ def told_by(
     if estimate.learns:
         moved = H @ estimate.by_scale
         if stretched is not None:
-            moved = moved + stretched
-            estimate.scale = estimate.scale.taught(y, S_inverse, moved)
+            moved = moved + stretched[0]
+            estimate.scale = estimate.scale.taught(y, stretched[1] * S_inverse, moved)
         estimate.by_scale = estimate.by_scale - gain @ moved
     if estimate.follows_walk:
         learns = before[CLOCK, CLOCK] < KNOWN_CLOCK_S**2 and not (estimate.wide and any(estimate.without))

@@ -7,7 +7,6 @@ from contextlib import ExitStack
 from typing import Final
 
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.health import CLOCKS_APART_S
 from buddyline.protocol.messages import (
     Attitude,
     Candidates,
@@ -46,6 +45,8 @@ from buddyline.tools.pairs import Pair, pair_words, wanted_pair
 from msgspec import UNSET
 
 _RESULTS: Final = (POSE, REJECTED)
+# The offset of a solver's status is known to 3 ms, 1 sd, or better.
+STATUS_APART_S: Final = 0.012
 # Used where a log has no results of the solver: poses from tags are evaluated in the same way.
 _TAGS: Final = (ARTAG,)
 _TRACKS: Final = (TRACK, TRACK_LAG)
@@ -124,7 +125,7 @@ def _clocks_apart(log: Dive, pair: Pair, curves: Mapping[str, ClockCurve]) -> li
     """Return a line where the last status of a pair's solver says that the clocks differ."""
     told = [one.message for one in log.messages(SOLVER_STATUS.name) if one.ids == pair]
     last = told[-1] if told else None
-    if not isinstance(last, SolverStatus) or last.clock_skew_s is UNSET or abs(last.clock_skew_s) <= CLOCKS_APART_S:
+    if not isinstance(last, SolverStatus) or last.clock_skew_s is UNSET or abs(last.clock_skew_s) <= STATUS_APART_S:
         return []
     return [f"{log.name}: {apart_problem(pair, last.clock_skew_s, curves, last.stamp_ns)}"]
 

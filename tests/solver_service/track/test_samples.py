@@ -104,3 +104,17 @@ def test_motion_and_noise_are_not_false() -> None:
     values[500:560, 3:] += 1.6 * np.sin(np.linspace(0.0, np.pi, 60))[:, None]
     values[600:620, :3] += 8.0 * np.sin(np.linspace(0.0, np.pi, 20))[:, None]
     assert not false_ones(t, values).any()
+
+
+@pytest.mark.parametrize("at_once", [1, 1000])
+def test_of_a_unit_that_vibrates_torn_samples_alone_are_false(at_once: int) -> None:
+    """A thruster beside the accelerometer: what is far for others is common there."""
+    t, values = swum(1000)
+    values[:, :3] += np.random.default_rng(7).normal(0.0, 2.0, (1000, 3))
+    values[600], values[700, 3:] = 60.0, 9.0
+    samples = Samples()
+    for first in range(0, len(t), at_once):
+        samples.add(t[first : first + at_once], values[first : first + at_once])
+    left_out = np.setdiff1d(t, samples.times_s)
+    assert {6.0, 7.0} <= set(np.round(left_out, 2).tolist())
+    assert len(left_out[left_out > 0.4]) < 8
