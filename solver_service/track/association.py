@@ -146,10 +146,10 @@ def variance_of(sigma_px: float, common: float, gross: float) -> float:
 
 
 def doubt_of(variance: float, sigma_px: float) -> float:
-    """Give what the variance of a light has beside sigma_px^2 for a gross error that it hardly has, px^2.
+    """Give by how much a light's variance exceeds sigma_px^2 because of an unlikely gross error, px^2; else 0.
 
-    The mixture's variance makes a residual that is large look like an expected one. That is right where a light moves
-    an estimate. But how large residuals are is not to be learned so: of what is Gaussian, the tails would not count.
+    The mixture's variance makes a large residual look like an expected one. That is right where a light moves an
+    estimate. The spread of residuals must be learned without it: otherwise the tails of a Gaussian would not count.
     """
     added_px2 = variance - sigma_px * sigma_px
     return added_px2 if 0.0 < added_px2 < 0.5 * GROSS_PX**2 else 0.0

@@ -169,10 +169,9 @@ class TrackFilter(TrackPool):
     def doubted(self) -> bool:
         """Whether a live track is not to be told; `problems` says why.
 
-        Both bars contradict each other by more than MOST_GAP. Its clocks prove further apart than it bears, or did
-        lately, or the last fixes contradict it: its first updates
-        were then far from linear. Or no fix has agreed with it, and few pictures have shown both lights. A track that
-        starts anew believes in its clocks anew.
+        Its clocks prove further apart than it bears, or did lately, or the last fixes contradict it: its first updates
+        were then far from linear. Or no fix has agreed with it, and few pictures have shown both lights. Or both bars
+        contradict each other by more than MOST_GAP. A track that starts anew believes in its clocks anew.
         """
         main = self.main
         if main is None:

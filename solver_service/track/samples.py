@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 # Further apart, and what lies between two samples is not told.
 GAP_S: Final = 0.06
 # A sample further than this from both its neighbours, in any axis of force (m/s^2) or rate (rad/s), is false: a torn or
-# a wrong reading. Divers, shaken housings and noise stay below a tenth of it from one sample to the next at 100 Hz. So
-# does one that is further than so many times what the last true ones were apart, in the middle.
+# a wrong reading. Divers, shaken housings and noise stay below a tenth of it from one sample to the next at 100 Hz.
+# Where a unit vibrates, the limit is so many times the median distance of the last true samples, if that is more.
 FALSE: Final[Floats] = np.repeat((5.0, 0.5), 3)
 FALSE_TIMES: Final = 8.0
 _LAST_ONES: Final = 33

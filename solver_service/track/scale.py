@@ -84,8 +84,8 @@ def by_scale(H: Floats, state: State, other: int, lights_m: Floats) -> Floats:
 def with_gap(P: Floats, share: float, U: Floats, state: State) -> Floats:
     """Give covariances (..., N, N) of states with what a gap may make of them: its share of U (N,), and what follows.
 
-    Which bar or focal length is as stated is not known. Half of the gap is the distance's, so that one of them may be
-    right. With a focal length that is off a camera turns by the gap's share of the angle at which it sees the other.
+    It is not known which bar or focal length is wrong. So half of the gap is counted as an error of the distance. A
+    focal length that is off turns its camera by the gap's share of the angle at which it sees the other node.
     """
     r_m = state.r_m
     toward = np.stack((r_m, -r_m), axis=-2)

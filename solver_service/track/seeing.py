@@ -289,9 +289,9 @@ def told_by(
     """Update all but an estimate's state; give the error (SIZE,) to add to that, and chi^2 of the residuals y (m,).
 
     more (m,): by how much variances count more than they are, in all but chi^2. doubts (m,): of lights, which teach
-    shaking and shares: what their variances have for doubts that shaking does not share. stretched: of lights, h (m,)
-    as `scale.by_scale` gives it, and how much of a picture of its own this one is. others: how many rows, the first
-    ones, are not of lights.
+    shaking and shares: the part of their variances that stands for unlikely gross errors; shaking is learned without
+    it. stretched: of lights, h (m,) as `scale.by_scale` gives it, and this picture's weight, below 1 where its errors
+    are those of earlier pictures. others: how many rows, the first ones, are not of lights.
     """
     before = estimate.covariance
     if more is None or not more.any():

@@ -51,9 +51,9 @@ def learned(
     """Go on by the likelihood's slope (n,) and its information (n, n), both by the logs (n,) of variances.
 
     information (2, n, n): what has been learned of the logs, and of the variances as shares of the first ones; kept: so
-    much of it counts on. What a calm time tells of the logs is little, so that shaking which begins is believed at
-    once, but by the logs it would be believed for long after it has ended. By the variances it is the other way round.
-    The longer step is taken.
+    much of it counts on. In calm times the logs gain little information, so that shaking which begins is believed at
+    once. But by the logs alone, shaking that has ended would be believed for long. By the variances it is the other way
+    round. The longer of both steps is taken.
     """
     share = np.exp(logs - first_logs)
     both, slopes = np.empty_like(information), np.empty((2, len(logs), 1))
