@@ -169,15 +169,17 @@ class TrackFilter(TrackPool):
     def doubted(self) -> bool:
         """Whether a live track is not to be told; `problems` says why.
 
-        Its clocks prove further apart than it bears, or did lately, or the last fixes contradict it: its first updates
-        were then far from linear. Or no fix has agreed with it, and few pictures have shown both lights. Or both bars
+        No fix has agreed with it, and few pictures have shown both lights. Or its clocks prove further apart than it
+        bears, or did lately, or the last fixes contradict it: its first updates were then far from linear. Or both bars
         contradict each other by more than MOST_GAP. A track that starts anew believes in its clocks anew.
         """
         main = self.main
         if main is None:
             return False
-        # A pair at rest tells little of its clocks, and less than it believes.
-        if abs(main.state.clock_s) > max(FAR_CLOCK_S, FAR_SIGMAS * math.sqrt(main.covariance[CLOCK, CLOCK])):
+        founded = not main.searched or main.agreed > 0 or self._followed(main)
+        # A pair at rest tells little of its clocks, and less than it believes; a start that is not told may be wrong.
+        far_s = max(FAR_CLOCK_S, FAR_SIGMAS * math.sqrt(main.covariance[CLOCK, CLOCK]))
+        if founded and abs(main.state.clock_s) > far_s:
             self._apart_s = main.t_s
         apart = main.t_s - self._apart_s < APART_S
         # With a dark lamp there may be no fix but another's for minutes.
@@ -190,7 +192,6 @@ class TrackFilter(TrackPool):
             self._problems.report(f"{self.both}: their clocks are far apart: no live track", main.t_s)
         if contradicted and main.contradicted >= FIXES_TO_SAY:
             self._problems.report(f"{self.both}: poses contradict the live track", main.t_s)
-        founded = not main.searched or main.agreed > 0 or self._followed(main)
         if main.confirmed and not founded:
             self._problems.report(f"{self.both}: no pose, and few pictures with both lamps: no live track", main.t_s)
         return apart or contradicted or not founded or (unequal and abs(main.scale.share) > MOST_GAP)

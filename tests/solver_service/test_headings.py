@@ -110,11 +110,11 @@ def test_the_solver_says_that_compasses_disagree(dive):
     assert "compasses of a and b disagree by 8" in problems[1]
 
 
-def turned(message):
-    """B's compass is 80 degrees off."""
-    if not isinstance(message, Attitude) or message.node != "b":
+def turned(message, node="b", off_deg=80.0):
+    """A node's compass is off."""
+    if not isinstance(message, Attitude) or message.node != node:
         return message
-    R = rotation((0, 0, 1), math.radians(80.0)) @ quat_to_matrix(np.array(message.q_ned_body_xyzw))
+    R = rotation((0, 0, 1), math.radians(off_deg)) @ quat_to_matrix(np.array(message.q_ned_body_xyzw))
     return msgspec.structs.replace(message, q_ned_body_xyzw=tuple(matrix_to_quat(R).tolist()))
 
 

@@ -21,6 +21,7 @@ from msgspec.structs import replace
 
 from tests.soak.shared import simulated
 from tests.solver_service.conftest import dive_messages
+from tests.solver_service.test_headings import turned
 
 
 def tracks_of(messages, *modes, rate_hz=20.0, receive=False):
@@ -40,6 +41,15 @@ def inertial_dive():
 @pytest.fixture(scope="module")
 def filtered(inertial_dive):
     return tracks_of(inertial_dive[0], "filter")[0]
+
+
+def test_a_wrong_start_does_not_withhold_the_track_that_replaces_it(inertial_dive):
+    """Compasses 36 degrees apart: a start without a fix puts the clocks apart. It gives way to the first pose."""
+    messages, _ = inertial_dive
+    solver = SolverCore(Settings(), [("a", "b")], track=TrackSettings(frozenset(("filter",))))
+    found = solver.handle_many([turned(message, "b", 30.0) for message in messages]) + solver.flush()
+    first_ns = min(one.stamp_ns for one in found if isinstance(one, RelativePose))
+    assert min(one.stamp_ns for one in found if isinstance(one, Track)) < first_ns + S_NS
 
 
 def rejected(stamp_ns):
