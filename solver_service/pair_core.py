@@ -168,7 +168,9 @@ class PairCore:
                 self._reject(Unmatched(one.trigger, one.stamp_ns, fix.reason, fix.detail))
             else:
                 self.counts["solved"] += 1
-                self._settled.append(relative_pose(one.frame_a, one.frame_b, one.rig_a, one.sensed_a, fix))
+                self._settled.append(
+                    relative_pose(one.frame_a, one.frame_b, one.rig_a, (one.sensed_a, one.sensed_b), fix)
+                )
         self._unsettled.clear()
 
     def _reject(self, one: Unmatched) -> None:

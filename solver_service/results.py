@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from buddyline.protocol.messages import Attitude, Blob, Candidates, Depth, NodeInfo, RelativePose
 from buddyline.solver_service.geometry.camera import Camera
+from buddyline.solver_service.geometry.compasses import north_doubt
 from buddyline.solver_service.geometry.direction import direction_of
 from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, skew
 from buddyline.solver_service.geometry.trigger import Fix, Rig, Sensed, View
@@ -89,8 +90,13 @@ def sensed_of(attitude: SampleStream[Attitude], depth: SampleStream[Depth], stam
     )
 
 
-def relative_pose(frame_a: Candidates, frame_b: Candidates, rig_a: Rig, sensed_a: Sensed, fix: Fix) -> RelativePose:
-    """Return the message for a fix. Its values in NED are computed with A's attitude, and absent without."""
+def relative_pose(
+    frame_a: Candidates, frame_b: Candidates, rig_a: Rig, sensed: tuple[Sensed, Sensed], fix: Fix
+) -> RelativePose:
+    """Return the message for a fix. Its values in NED are computed with A's attitude, and absent without.
+
+    Where B's compass contradicts A's, either may be wrong: their sigmas hold it.
+    """
     pose = RelativePose(
         node_a=frame_a.node,
         node_b=frame_b.node,
@@ -113,9 +119,15 @@ def relative_pose(frame_a: Candidates, frame_b: Candidates, rig_a: Rig, sensed_a
         skew_ns=frame_a.stamp_ns - frame_b.stamp_ns,
         heading_gap_rad=UNSET if fix.heading is None else fix.heading.gap_rad,
     )
-    if sensed_a.q_ned_body_xyzw is None or sensed_a.sigma_rad is None:
+    of_a, of_b = sensed
+    if of_a.q_ned_body_xyzw is None or of_a.sigma_rad is None:
         return pose
-    return in_ned(pose, rig_a.R_body_camera, sensed_a.q_ned_body_xyzw, sensed_a.sigma_rad)
+    sigma_rad = of_a.sigma_rad
+    if fix.heading is not None and of_b.sigma_rad is not None:
+        stated = float(sigma_rad[2] ** 2), float(of_b.sigma_rad[2] ** 2)
+        doubt = north_doubt((0.0, -fix.heading.gap_rad), stated, fix.heading.variance)
+        sigma_rad = np.array((*sigma_rad[:2], math.sqrt(stated[0] + doubt)))
+    return in_ned(pose, rig_a.R_body_camera, of_a.q_ned_body_xyzw, sigma_rad)
 
 
 def in_ned(pose: RelativePose, R_body_camera: Floats, q_ned_body_xyzw: Floats, sigma_rad: Floats) -> RelativePose:

@@ -11,6 +11,7 @@ from earlier ones needs no such witness: a diver passes by steel.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -71,3 +72,18 @@ def compare_headings(
         agrees = off_rad * off_rad < EXPLAINED_CHI2 * (learned.variance + variance)
     contradicts = not agrees and not (follows and abs(gap_rad) <= MOST_APART_RAD)
     return HeadingGap(gap_rad, variance, azimuth_rad, agrees, contradicts)
+
+
+def north_doubt(off_rad: Sequence[float], variances: Sequence[float], variance: float) -> float:
+    """Give the variance, rad^2, that north has beside what two compasses state; 0 unless they are further apart.
+
+    off_rad (2,): each compass minus the north that is told. variances (2,): as they state, rad^2. variance: of their
+    difference, by what tells how the nodes are turned to each other. One compass is right, and which of the two is as
+    open as their variances say. Where the north that is told is their weighted mean, this is Birge's ratio (Phys. Rev.
+    40, 207, 1932), by which the Particle Data Group widens what two measurements tell that do not agree.
+    """
+    stated, apart = sum(variances), off_rad[1] - off_rad[0]
+    if apart * apart <= stated + variance:
+        return 0.0
+    right = variances[0] * off_rad[1] ** 2 + variances[1] * off_rad[0] ** 2
+    return (1.0 - (stated + variance) / (apart * apart)) * right / stated

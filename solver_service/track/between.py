@@ -67,6 +67,7 @@ def _rows_together(
         _mixed(share, path.rates_radps[one], path.rates_radps[two]),
         path.lights[near],
         np.maximum(times_s - path.light_s[near], 0.0),
+        path.north_doubt[two],
     )
 
 

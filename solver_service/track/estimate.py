@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import bisect
+import math
 from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
+from buddyline.solver_service.geometry.compasses import north_doubt
 from buddyline.solver_service.geometry.rotation import Floats, rotation_log
 from buddyline.solver_service.track.scale import ScaleGap
 from buddyline.solver_service.track.shaking import Shaking
-from buddyline.solver_service.track.state import MOVING, SIZE, State
+from buddyline.solver_service.track.state import MOVING, PHI, SIZE, State
 from buddyline.solver_service.track.trail import Chosen, Trail
 from buddyline.solver_service.track.vibration import SHARES, Shares
 from buddyline.solver_service.track.walking import Walking
@@ -33,7 +35,8 @@ class Estimate:
     the lasting part (3,) of what its attitudes are off their prediction, in sigmas. by_shares (SIZE, 4): how the state
     would be moved by a share of 1 of the samples' fast parts; shares: what the lights tell of them (vibration.py).
     by_scale (SIZE,), scale: the same of a gap between both bars (scale.py).
-    attitude_s, depth_s: when attitudes and depths were last used.
+    attitude_s, depth_s: when attitudes and depths were last used. compasses: each node's heading as its last attitude
+    had it, minus the track's, rad, and the variance that it stated, rad^2.
 
     The lights: detection (2, 2): by observer and light, how often a light in the picture is found; shown (2, 2): how
     likely it was to be found at shown_s, by observer, after the last picture had told. last_seen (2,):
@@ -73,6 +76,7 @@ class Estimate:
     trigger: list[tuple[float, int, int]] = field(default_factory=list)
     attitude_s: list[float] = field(default_factory=lambda: [-np.inf, -np.inf])
     depth_s: float = -np.inf
+    compasses: list[tuple[float, float]] = field(default_factory=lambda: [(0.0, np.inf), (0.0, np.inf)])
     steps: Trail = field(default_factory=Trail)
     confirmed: bool = False
     shaking: Shaking = field(default_factory=Shaking)
@@ -119,13 +123,34 @@ class Estimate:
         self.light_s = max(self.light_s, self.start_s)
 
     @property
+    def north_doubt(self) -> float:
+        """Give the variance, rad^2, that north has beside the covariance, as both compasses contradict each other."""
+        (off_a, variance_a), (off_b, variance_b) = self.compasses
+        if not math.isfinite(variance_a + variance_b):
+            return 0.0
+        # How the nodes are turned to each other, about the vertical.
+        P, a, b = self.covariance, PHI[0].stop - 1, PHI[1].stop - 1
+        variance = float(P[a, a] + P[b, b] - 2.0 * P[a, b])
+        return north_doubt((off_a, off_b), (variance_a, variance_b), variance)
+
+    @property
     def lights(self) -> int:
         """Give how many lights the last trigger's pictures told."""
         return len({(observer, light) for _, observer, light in self.trigger})
 
     def copied(self, **changes: object) -> Estimate:
         """Give an estimate that goes its own way from here."""
-        of_nodes = "evidence_by", "attitude_s", "told_by", "missed", "looks_away", "without", "turning_off", "shown_s"
+        of_nodes = (
+            "evidence_by",
+            "attitude_s",
+            "compasses",
+            "told_by",
+            "missed",
+            "looks_away",
+            "without",
+            "turning_off",
+            "shown_s",
+        )
         lists = *of_nodes, "trigger", "course", "saw"
         own: dict[str, object] = {name: list(getattr(self, name)) for name in lists}
         own |= {"detection": self.detection.copy(), "shown": self.shown.copy(), "lit_s": self.lit_s.copy()}

@@ -320,6 +320,7 @@ class TrackFilter(TrackPool):
         estimate = Estimate(t_s, state, covariance, t_s, agreed_s=t_s, agreed=1)
         if attitudes[0] is not None:
             estimate.attitude_s[0] = t_s
+            estimate.compasses[0] = 0.0, float(attitudes[0][1].sigma_rad[2] ** 2)
         estimate.light_s = t_s
         self._open(estimate)
         return estimate
@@ -437,4 +438,4 @@ class TrackFilter(TrackPool):
             self._step(main, main.t_s + TICK_S, None)
         row = self._present(main, t_s)
         self._last_row = main, row
-        return DueRow(stamp_ns, row, main.rates_radps, main.lights, t_s - main.light_s)
+        return DueRow(stamp_ns, row, main.rates_radps, main.lights, t_s - main.light_s, main.north_doubt)

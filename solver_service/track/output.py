@@ -20,6 +20,8 @@ WORST_SHARE: Final = 0.2
 CONTRADICTS: Final = 33.0
 # a x b = _ACROSS (a b^T), the product's nine numbers row by row.
 _ACROSS: Final = -skew(np.eye(3)).reshape(3, 9)
+# r @ _ABOUT_DOWN = down x r.
+_ABOUT_DOWN: Final = skew(np.array((0.0, 0.0, 1.0))).T
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,10 +126,12 @@ def rows_of(
     rates_radps: Floats,
     lights: NDArray[np.int64],
     ages_s: Floats,
+    north_doubts: Floats,
 ) -> list[TrackRow | None]:
     """Give the rows of a batch of states (N), None where a position is no better than WORST_SHARE of the range.
 
-    P (N, C, C): the covariances of COLUMNS.
+    P (N, C, C): the covariances of COLUMNS. north_doubts (N,): variances of what turns all about the vertical, which
+    only what is told in north-east-down has.
     """
     now = at_one_time(states, rates_radps)
     toward = np.swapaxes(now.R[:, 0], -1, -2)
@@ -137,6 +141,8 @@ def rows_of(
     ranges_m = np.sqrt(inner(now.r_m, now.r_m))
     told = np.isfinite(whole).all(axis=(1, 2))
     told &= np.sqrt(np.trace(whole[:, :3, :3], axis1=1, axis2=2)) <= WORST_SHARE * ranges_m
+    turned_m = now.r_m @ _ABOUT_DOWN
+    whole[:, 9:, 9:] += north_doubts[:, None, None] * (turned_m[:, :, None] * turned_m[:, None, :])
     sigma_ned_m = np.sqrt(np.maximum(whole[:, range(9, 12), range(9, 12)], 0.0))
     t = (toward @ now.r_m[..., None])[..., 0]
     v = (toward @ now.v_mps[..., None])[..., 0]

@@ -232,7 +232,8 @@ class PathPass(TrackSteps):
         self._off = before
         self._take_attitude(main, at_s)
         self._take_turning(main, at_s)
-        return Step(at_s, before, before, main.covariance, F, Q, walk, main.rates_radps, main.light_s, main.lights)
+        so_far = main.light_s, main.lights, main.north_doubt
+        return Step(at_s, before, before, main.covariance, F, Q, walk, main.rates_radps, *so_far)
 
     def _seen(self, step: Step, seen: Sequence[tuple[Sight, BySight]]) -> Step:
         """Take the depths and the pictures of a step together."""

@@ -46,10 +46,10 @@ SWINGS: Final = 20
 class Path:
     """Smoothed steps as columns, in order of time.
 
-    t_s, light_s (N,), lights (N,), rates_radps (N, 2, 3): of the steps. states: State.row of each. halves: of the
-    covariance of COLUMNS, its upper half. drawn (N, 6): variances that noise added in the step before, of A's and B's
-    attitude and of the velocity: by shaking, and by all else. without (N, 2): which node had no
-    inertial unit in that step. oldest (SIZE, SIZE): the whole covariance at the first step. auxiliary (N, 3, 3), where
+    t_s, light_s (N,), lights (N,), north_doubt (N,), rates_radps (N, 2, 3): of the steps. states: State.row of each.
+    halves: of the covariance of COLUMNS, its upper half. drawn (N, 6): variances that noise added in the step before,
+    of A's and B's attitude and of the velocity: by shaking, and by all else. without (N, 2): which node had no inertial
+    unit in that step. oldest (SIZE, SIZE): the whole covariance at the first step. auxiliary (N, 3, 3), where
     it was asked for: of the step before, for the velocity and for A's and B's turn rates, the auxiliary residual's
     square (the sum of its axes), what that is expected to be, and the variance that noise added (one axis). across
     (N, C, C), where it was asked for: the covariance of COLUMNS of the step before (rows) with each step (columns).
@@ -58,6 +58,7 @@ class Path:
     t_s: Floats
     light_s: Floats
     lights: NDArray[np.int64]
+    north_doubt: Floats
     rates_radps: Floats
     states: Floats
     halves: Floats
@@ -74,7 +75,8 @@ class Path:
 
     def after(self, earlier: Path) -> Path:
         """Give this path with an earlier one before it, whose last step is its first."""
-        columns = ("t_s", "light_s", "lights", "rates_radps", "states", "halves", "drawn", "without", "auxiliary")
+        of_steps = "t_s", "light_s", "lights", "north_doubt", "rates_radps"
+        columns = (*of_steps, "states", "halves", "drawn", "without", "auxiliary")
         both = {name: np.concatenate((getattr(earlier, name)[:-1], getattr(self, name))) for name in columns}
         return Path(**both, looks=[*earlier.looks[:-1], *self.looks], oldest=earlier.oldest)
 
@@ -131,6 +133,7 @@ def smoothed(
         t_s=np.empty(count),
         light_s=np.empty(count),
         lights=np.empty(count, np.int64),
+        north_doubt=np.empty(count),
         rates_radps=np.empty((count, 2, 3)),
         states=np.empty((count, ROW)),
         halves=np.empty((count, len(_UPPER[0]))),
@@ -164,6 +167,7 @@ def smoothed(
             P = step.covariance + gain @ (P - P_before) @ gain.T
             P = 0.5 * (P + P.T)
         path.t_s[k], path.light_s[k], path.lights[k] = step.t_s, step.light_s, step.lights
+        path.north_doubt[k] = step.north_doubt
         found[k], path.halves[k] = here, P[_BLOCK_UPPER]
         drawn[k] = step.Q[_DRAWN]
         path.rates_radps[k] = step.rates_radps

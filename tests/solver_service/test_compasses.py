@@ -7,7 +7,7 @@ import pytest
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import RelativePose
 from buddyline.solver_service.core import SolverCore
-from buddyline.solver_service.geometry.compasses import Contradiction, HeadingGap, compare_headings
+from buddyline.solver_service.geometry.compasses import Contradiction, HeadingGap, compare_headings, north_doubt
 from buddyline.solver_service.geometry.observation import Heading
 from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.witness import FEWEST, MOST, Witnesses
@@ -96,6 +96,33 @@ def test_as_many_witnesses_are_needed_as_two_seconds_have_triggers(rate_hz, need
 def test_after_a_pause_no_fewer_witnesses_are_needed():
     told = at_rest(10, MOST + 1, 20, 3, pause_s=20)
     assert [k for k, one in enumerate(told, start=1) if one] == [MOST, MOST + 1]
+
+
+def test_north_is_doubtful_as_compasses_contradict_each_other():
+    variances, of_pose = (0.05**2, 0.1**2), 0.01**2
+    weights = np.array((variances[1], variances[0])) / sum(variances)
+    # Within what they state, nothing is doubtful.
+    assert north_doubt((0.0, 0.1), variances, of_pose) == 0.0
+    # Of their weighted mean, it is what Birge's ratio makes of it.
+    off_rad = 0.4 * np.array((-weights[1], weights[0]))
+    mean_variance = variances[0] * variances[1] / sum(variances)
+    birge = mean_variance * 0.4**2 / sum(variances)
+    assert north_doubt(off_rad.tolist(), variances, 0.0) == pytest.approx(birge - mean_variance)
+
+
+def test_north_errs_as_stated_whichever_compass_is_off():
+    rng = np.random.default_rng(4)
+    sigma_rad, squares = math.radians(4.0), []
+    for off in rng.choice((-1.0, 1.0), 2000) * math.radians(25.0):
+        compasses = sigma_rad * rng.standard_normal(2)
+        compasses[rng.integers(2)] += off
+        # As a pose tells it, by A's compass, and as a track does, by the mean of both.
+        for north, told in ((compasses[0], sigma_rad**2), (compasses.mean(), sigma_rad**2 / 2.0)):
+            doubt = north_doubt((compasses - north).tolist(), (sigma_rad**2, sigma_rad**2), 0.0)
+            squares.append(north**2 / (told + doubt))
+    by_pose, by_track = np.reshape(squares, (-1, 2)).mean(axis=0)
+    assert 0.7 < by_pose < 1.3
+    assert 0.7 < by_track < 1.3
 
 
 def at_rest(rate_hz, count, gap_deg, scatter_deg, pause_s=0):

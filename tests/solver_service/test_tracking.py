@@ -43,6 +43,27 @@ def filtered(inertial_dive):
     return tracks_of(inertial_dive[0], "filter")[0]
 
 
+@pytest.mark.parametrize("node", ["a", "b"])
+def test_poses_and_tracks_say_that_north_is_in_doubt_where_compasses_contradict_each_other(inertial_dive, node):
+    messages, world = inertial_dive
+    solver = SolverCore(Settings(), [("a", "b")], track=TrackSettings(frozenset(("filter", "lag", "smooth"))))
+    found = solver.handle_many([turned(message, node, 30.0) for message in messages]) + solver.flush()
+    kinds = {}
+    for one in found:
+        if isinstance(one, Track | RelativePose):
+            north, east, _ = (world.T_ned_camera("a", one.stamp_ns)[0] @ world.truth(one.stamp_ns, 0).t_a_b_m).tolist()
+            off_rad = np.remainder(one.azimuth_rad - np.arctan2(east, north) + np.pi, 2.0 * np.pi) - np.pi
+            mode = one.mode if isinstance(one, Track) else "pose"
+            kinds.setdefault(mode, []).append((off_rad, one.sigma_azimuth_rad))
+    assert kinds.keys() == {"pose", "filter", "lag", "smooth"}
+    for mode, told in kinds.items():
+        off_rad, sigma_rad = np.abs(told).T
+        # Half of the gap at least, and no longer what a compass of 3 to 5 degrees states.
+        assert np.radians(10.0) < sigma_rad.min(), mode
+        assert sigma_rad.max() < np.radians(35.0), mode
+        assert (off_rad < 2.5 * sigma_rad).all(), mode
+
+
 def test_a_wrong_start_does_not_withhold_the_track_that_replaces_it(inertial_dive):
     """Compasses 36 degrees apart: a start without a fix puts the clocks apart. It gives way to the first pose."""
     messages, _ = inertial_dive
