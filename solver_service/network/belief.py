@@ -45,6 +45,7 @@ from buddyline.solver_service.track.moving import (
     increments,
     sudden_rate,
 )
+from buddyline.solver_service.track.shaking import without_doubts
 from buddyline.solver_service.track.stepping import ATTITUDE_EVERY_S, TICK_S
 from buddyline.solver_service.track.strapdown import Noise
 
@@ -351,8 +352,7 @@ class NetBelief:
         if self.trail is not None:
             self.trail.events.append(Learned(H, gain, S_inverse, y))
         if doubts is not None:
-            of_all = np.linalg.inv(np.linalg.inv(S_inverse) - np.diag(doubts)) if doubts.any() else S_inverse
-            self.shaking = self.shaking.taught(y, of_all, H, gain)
+            self.shaking = self.shaking.taught(y, without_doubts(S_inverse, doubts), H, gain)
         self.state = self.state.plus(error)
 
     def _take_depths(self) -> None:

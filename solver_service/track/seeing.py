@@ -26,6 +26,7 @@ from buddyline.solver_service.track.lights import (
 )
 from buddyline.solver_service.track.moving import KNOWN_CLOCK_S, TrackMoves
 from buddyline.solver_service.track.scale import by_scale
+from buddyline.solver_service.track.shaking import without_doubts
 from buddyline.solver_service.track.smoother import Path
 from buddyline.solver_service.track.state import (
     CLOCK,
@@ -317,8 +318,8 @@ def told_by(
     # gauges' offset, which is not followed, depth would even add to it, more each time.
     if doubts is not None:
         moving = H[:, :MOVING]
-        of_all = np.linalg.inv(np.linalg.inv(S_inverse) - np.diag(doubts)) if doubts.any() else S_inverse
-        estimate.shaking = estimate.shaking.taught(y, of_all, moving[:, :NAV], estimate.shaken[:, :NAV, :NAV])
+        sure = without_doubts(S_inverse, doubts)
+        estimate.shaking = estimate.shaking.taught(y, sure, moving[:, :NAV], estimate.shaken[:, :NAV, :NAV])
         rest = _STILL - gain[:MOVING, others:] @ moving[others:]
         estimate.shaken = rest @ estimate.shaken @ rest.T
     return error, chi2

@@ -66,6 +66,14 @@ def learned(
     return logs + np.minimum(np.maximum(step, -LONGEST_STEP), LONGEST_STEP), information
 
 
+def without_doubts(S_inverse: Floats, doubts: Floats) -> Floats:
+    """Give S^-1 of residuals without doubts (m,): the part of lights' variances that stands for unlikely gross errors.
+
+    Shaking is learned so (`association.doubt_of`).
+    """
+    return np.asarray(np.linalg.inv(np.linalg.inv(S_inverse) - np.diag(doubts))) if doubts.any() else S_inverse
+
+
 @dataclass(frozen=True, eq=False)
 class Shaking:
     """Logs of three variances, both units' angles (rad^2) and the velocity between them.
