@@ -44,7 +44,7 @@ from buddyline.solver_service.track.records import (
     until_one_ended,
 )
 from buddyline.solver_service.track.relax import PassedOver, PathPass
-from buddyline.solver_service.track.scale import ScaleGap, said, scaled
+from buddyline.solver_service.track.scale import ScaleGap, gap_words, scaled
 from buddyline.solver_service.track.settling import clock_sigma_s, settled
 from buddyline.solver_service.track.smoother import Path, smoothed
 from buddyline.solver_service.track.start import CLOCK_S
@@ -114,7 +114,7 @@ def smooth(
         records = a, b
     assert isinstance(found, Smoothed)
     names = [record.node.name for record in records]
-    return replace(found, problems=[*found.problems, said(gap, names)]) if gap else found
+    return replace(found, problems=[*found.problems, gap_words(gap, names)]) if gap else found
 
 
 def _of_bars(

@@ -19,7 +19,7 @@ from buddyline.solver_service.track.lights import BLOCK, COLUMNS, Sight
 from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S, excerpt
 from buddyline.solver_service.track.output import CONTRADICTS, TrackRow, fix_chi2, fix_residual
 from buddyline.solver_service.track.pool import MAX_TENTATIVE, TrackPool
-from buddyline.solver_service.track.scale import MOST_GAP, said, with_gap
+from buddyline.solver_service.track.scale import MOST_GAP, gap_words, with_gap
 from buddyline.solver_service.track.seeing import ONE_TRIGGER_S
 from buddyline.solver_service.track.start import CLOCK_S, state_from_fix
 from buddyline.solver_service.track.state import CLOCK, SIZE, State, place_covariance
@@ -187,7 +187,7 @@ class TrackFilter(TrackPool):
         contradicted = lately and main.contradicted >= max(FIXES_TO_DOUBT, SHARE_TO_DOUBT * main.agreed)
         unequal = main.confirmed and main.scale.found
         if unequal:
-            self._problems.report(said(main.scale.share, [node.name for node in self.nodes]), main.t_s)
+            self._problems.report(gap_words(main.scale.share, [node.name for node in self.nodes]), main.t_s)
         if apart:
             self._problems.report(f"{self.both}: their clocks are far apart: no live track", main.t_s)
         if contradicted and main.contradicted >= FIXES_TO_SAY:

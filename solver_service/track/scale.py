@@ -59,7 +59,7 @@ class ScaleGap:
         return ScaleGap(self.information + other.information - FIRST_SCALE**-2, self.told + other.told)
 
 
-def said(share: float, names: Sequence[str]) -> str:
+def gap_words(share: float, names: Sequence[str]) -> str:
     """Say that there is a gap between two nodes."""
     a, b = names
     than = "longer" if share > 0.0 else "shorter"
