@@ -48,6 +48,7 @@ from buddyline.solver_service.track.scale import ScaleGap, gap_words, scaled
 from buddyline.solver_service.track.settling import clock_sigma_s, settled
 from buddyline.solver_service.track.smoother import Path, smoothed
 from buddyline.solver_service.track.start import CLOCK_S
+from buddyline.solver_service.track.trail import Trail
 from buddyline.solver_service.track.vibration import Shares
 from buddyline.solver_service.track.walking import Walking, joint
 
@@ -101,51 +102,71 @@ def smooth(
     """
     a, b = until_one_ended((in_order(records[0]), in_order(records[1])), clock_ns)
     records, fixes, gap = (judged(parted(a)), judged(parted(b))), sorted(fixes, key=stamp_of), 0.0
-    for left in reversed(range(GAP_ROUNDS)):
-        found = _of_bars(records, fixes, outputs_ns, clock_ns, gap, again=again, closes=left > 0)
-        if isinstance(found, Smoothed):
+    first = _first_pass(records, fixes, clock_ns)
+    for _ in range(GAP_ROUNDS - 1):
+        more = first.gap_beyond(gap)
+        if not more:
             break
-        gap += found
-        shares = -0.5 * found, 0.5 * found
+        # Its steps only take memory now.
+        del first
+        gap += more
         a, b = (
             replace(record, node=replace(record.node, rig=scaled(record.node.rig, share)))
-            for record, share in zip(records, shares, strict=True)
+            for record, share in zip(records, (-0.5 * more, 0.5 * more), strict=True)
         )
         records = a, b
-    assert isinstance(found, Smoothed)
+        first = _first_pass(records, fixes, clock_ns)
+    found = _of_first_pass(first, records, fixes, outputs_ns, clock_ns, gap, again=again)
     names = [record.node.name for record in records]
     return replace(found, problems=[*found.problems, gap_words(gap, names)]) if gap else found
 
 
-def _of_bars(
+@dataclass(frozen=True, eq=False)
+class _FirstPass:
+    """A filter that has passed over a dive, its tracks, and how far B's clock was believed ahead."""
+
+    track: TrackFilter
+    parts: list[Estimate]
+    clock_ns: int
+
+    def gap_beyond(self, gap: float) -> float:
+        """Give by how much more the bars do not fit each other than the gap by which they were changed, 0 for not."""
+        found = reduce(ScaleGap.plus, [part.scale for part in self.parts], ScaleGap())
+        # A clock that jumps is no bar.
+        more = not in_pieces(self.parts) and (found.found or (gap and found.sigmas > GAP_LEFT_SIGMAS))
+        return found.share if more else 0.0
+
+
+def _first_pass(records: Records, fixes: Sequence[FixSeen], clock_ns: int) -> _FirstPass:
+    """Pass a filter over a whole dive. clock_ns: how far B's clock is believed ahead."""
+    long = bool(fixes) and fixes[-1].stamp_ns - fixes[0].stamp_ns > 2 * HEAD_NS
+    head_ns = (fixes[0].stamp_ns + HEAD_NS) // PIECE_NS * PIECE_NS if long else END_NS
+    first = _tries(records, fixes, clock_ns, head_ns)
+    if long and not any(map(mostly_without, first.parts)):
+        # The dive's beginning has given the clocks' offset: what is left of the dive mostly needs no other round.
+        pass_over(first.track, records, fixes, head_ns)
+        first = replace(first, parts=parts_of(first.track))
+        left_ns = clock_left_ns(first.parts)
+        if left_ns:
+            first = _rounds(records, fixes, first.clock_ns + left_ns)
+    return first
+
+
+def _of_first_pass(
+    passed: _FirstPass,
     records: Records,
     fixes: Sequence[FixSeen],
     outputs_ns: Sequence[int],
-    clock_ns: int,
+    told_ns: int,
     gap: float,
     *,
     again: bool,
-    closes: bool,
-) -> Smoothed | float:
-    """Give the track with the bars as they are in the records, or by how much more these do not fit each other.
+) -> Smoothed:
+    """Give the track of a dive that a filter has passed over.
 
-    gap: what they have been changed by. closes: whether a further gap is to be given.
+    told_ns: how far B's clock was told to be ahead. gap: what the bars have been changed by.
     """
-    told_ns = clock_ns
-    long = bool(fixes) and fixes[-1].stamp_ns - fixes[0].stamp_ns > 2 * HEAD_NS
-    head_ns = (fixes[0].stamp_ns + HEAD_NS) // PIECE_NS * PIECE_NS if long else END_NS
-    first, parts, clock_ns = _first_pass(records, fixes, clock_ns, head_ns)
-    if long and not any(map(mostly_without, parts)):
-        # The dive's beginning has given the clocks' offset: what is left of the dive mostly needs no other round.
-        pass_over(first, records, fixes, head_ns)
-        parts = parts_of(first)
-        left_ns = clock_left_ns(parts)
-        if left_ns:
-            first, parts, clock_ns = _rounds(records, fixes, clock_ns + left_ns)
-    between_bars = reduce(ScaleGap.plus, [part.scale for part in parts], ScaleGap())
-    # A clock that jumps is no bar.
-    if closes and not in_pieces(parts) and (between_bars.found or (gap and between_bars.sigmas > GAP_LEFT_SIGMAS)):
-        return between_bars.share
+    first, parts, clock_ns = passed.track, passed.parts, passed.clock_ns
     if not parts:
         return Smoothed([], clock_ns * 1e-9, math.inf, first.problems)
     parts = of_one_clock(parts)
@@ -158,7 +179,8 @@ def _of_bars(
     if without:
         # Without a gyro the offset cannot be told from the turning, and is taken as it was told. The first pass has
         # shown that it is small. Its steps only take memory now.
-        del first, parts
+        for part in passed.parts:
+            part.steps = Trail()
         only = _empty_filter(records, told_ns, CLOCK_WITHOUT_S)
         pass_over(only, records, fixes)
         return replace(_of_guessed_motion(records, only, fixes, outputs_ns, gap), clock_sigma_s=math.inf)
@@ -195,8 +217,8 @@ def _of_bars(
             span = f"no track for {lasted_s(part):.0f} s"
             lost.append(f"{first.both}: passes over the dive contradict the first one or do not settle: {span}")
     if not found and again and contradicting_ns is not None:
-        other = _of_bars(records, fixes, outputs_ns, contradicting_ns, gap, again=False, closes=False)
-        assert isinstance(other, Smoothed)
+        passed = _first_pass(records, fixes, contradicting_ns)
+        other = _of_first_pass(passed, records, fixes, outputs_ns, contradicting_ns, gap, again=False)
         return other if math.isfinite(other.clock_sigma_s) else replace(other, problems=[*other.problems, *lost])
     if not found:
         return Smoothed([], clock_ns * 1e-9, math.inf, [*first.problems, *lost])
@@ -271,27 +293,23 @@ def _path_before(known: PassedOver, path: Path, since_s: float) -> Path | None:
     return track.path_before(path, begin_s)
 
 
-def _first_pass(
-    records: Records, fixes: Sequence[FixSeen], clock_ns: int, stop_ns: int
-) -> tuple[TrackFilter, list[Estimate], int]:
-    """Give a filter that has passed over a dive up to stop_ns, its tracks, and how far B's clock was believed ahead.
+def _tries(records: Records, fixes: Sequence[FixSeen], clock_ns: int, stop_ns: int) -> _FirstPass:
+    """Pass over a dive up to stop_ns.
 
     Where that gives tracks in pieces other offsets are tried, and the one that explains most is taken. With units off
     their mounts each pass finds only a part of the offset, so the best is repeated while some is left.
     """
     best = _rounds(records, fixes, clock_ns, stop_ns)
     for try_s in CLOCK_TRIES_S:
-        if goes_on(best[1]):
+        if goes_on(best.parts):
             break
         other = _rounds(records, fixes, clock_ns + round(try_s * 1e9), stop_ns)
-        best = max(best, other, key=lambda found: sum(part.evidence for part in found[1]))
-    left_ns = clock_left_ns(best[1])
-    return _rounds(records, fixes, best[2] + left_ns, stop_ns) if left_ns else best
+        best = max(best, other, key=lambda found: sum(part.evidence for part in found.parts))
+    left_ns = clock_left_ns(best.parts)
+    return _rounds(records, fixes, best.clock_ns + left_ns, stop_ns) if left_ns else best
 
 
-def _rounds(
-    records: Records, fixes: Sequence[FixSeen], clock_ns: int, stop_ns: int = END_NS
-) -> tuple[TrackFilter, list[Estimate], int]:
+def _rounds(records: Records, fixes: Sequence[FixSeen], clock_ns: int, stop_ns: int = END_NS) -> _FirstPass:
     """Pass over a dive until the offset is settled: a pass whose clocks are off finds too small an offset."""
     for left in reversed(range(CLOCK_ROUNDS)):
         first = _empty_filter(records, clock_ns, CLOCK_S)
@@ -301,7 +319,7 @@ def _rounds(
         if not left or not left_ns:
             break
         clock_ns += left_ns
-    return first, parts, clock_ns
+    return _FirstPass(first, parts, clock_ns)
 
 
 def _empty_filter(records: Records, clock_ns: int, clock_sigma_s: float) -> TrackFilter:
