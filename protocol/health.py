@@ -27,6 +27,8 @@ NO_LIGHT_S: Final = 0.5
 FRAMES_APART_S: Final = 1.0
 # Between the clocks of two nodes. At 1 m/s, 5 ms are 5 mm.
 CLOCKS_APART_S: Final = 0.005
+# A solver's status has the clocks' offset when its sigma is below this.
+REPORTED_OFFSET_SIGMA_S: Final = 0.003
 # Between one node's clock and its time server, by chrony's estimate: two nodes then stay within CLOCKS_APART_S.
 CLOCK_OFF_S: Final = 0.002
 # Between two compasses: several times the sigma of calibrated compasses away from steel.

@@ -12,7 +12,7 @@ from typing import Final, TypeAlias
 import numpy as np
 from buddyline.protocol import __version__
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.health import CLOCKS_APART_S, HEADINGS_APART_RAD, NO_POSE_S
+from buddyline.protocol.health import CLOCKS_APART_S, HEADINGS_APART_RAD, NO_POSE_S, REPORTED_OFFSET_SIGMA_S
 from buddyline.protocol.messages import Candidates, Message, NodeInfo, Rejected, RelativePose, SolverStatus, Track
 from buddyline.protocol.topics import EXPECT, POSE, REJECTED, SOLVER_STATUS, TRACK, TRACK_LAG
 from buddyline.solver_service.alignment import ClockAlignment, ClockOffset
@@ -35,8 +35,6 @@ PairId: TypeAlias = tuple[str, str]
 # The topics that a pair publishes, and those that it publishes for each of its nodes.
 PUBLISHED: Final = (POSE, REJECTED, TRACK, TRACK_LAG, SOLVER_STATUS)
 PUBLISHED_FOR_NODES: Final = (EXPECT,)
-# The clock offset is reported when its sigma is below this.
-REPORTED_OFFSET_SIGMA_S: Final = 0.003
 ALIGN_EVERY_NS: Final = 10 * S_NS
 
 

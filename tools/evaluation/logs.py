@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from typing import Final
 
 from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.health import REPORTED_OFFSET_SIGMA_S
 from buddyline.protocol.messages import (
     Attitude,
     Candidates,
@@ -45,8 +46,8 @@ from buddyline.tools.pairs import Pair, pair_words, wanted_pair
 from msgspec import UNSET
 
 _RESULTS: Final = (POSE, REJECTED)
-# The offset of a solver's status is known to 3 ms, 1 sd, or better.
-STATUS_APART_S: Final = 0.012
+# Clocks are named as apart where a solver's status has them further apart than four sigmas of what it reports.
+STATUS_APART_S: Final = 4.0 * REPORTED_OFFSET_SIGMA_S
 # Used where a log has no results of the solver: poses from tags are evaluated in the same way.
 _TAGS: Final = (ARTAG,)
 _TRACKS: Final = (TRACK, TRACK_LAG)
