@@ -35,7 +35,7 @@ def filtered(seen: Floats, walk: float, noise: float) -> Trail:
         state = state.moved(state.r_m, state.v_mps + gain * (v - state.v_mps), state.R)
         P[V_, V_] *= 1.0 - gain
         steps.append(
-            Step(k * STEP_S, before.row, state.row, P, F, Q, np.zeros(SIZE - MOVING), np.zeros((2, 3)), 0.0, 0, ())
+            Step(k * STEP_S, before.row, state.row, P, F, Q, np.zeros(SIZE - MOVING), np.zeros((2, 3)), 0.0, 0)
         )
     return steps
 
@@ -78,6 +78,7 @@ def path_of(
         t_s=STEP_S * np.arange(count),
         light_s=nothing,
         lights=np.zeros(0, np.int64),
+        north_doubt=nothing,
         rates_radps=nothing,
         states=nothing,
         halves=nothing,
