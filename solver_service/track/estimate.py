@@ -28,15 +28,15 @@ class Estimate:
     """One hypothesis of where the nodes are, and how well it has explained the pictures since its start.
 
     The filter: rates_radps (2, 3): the turn rates at t_s. shaking: how much the units are shaken in their mounts, as
-    learned from the lights' residuals; shaken (3, MOVING, MOVING): the parts of the covariance that come from it.
-    walking: how much the units' biases walk, or the nodes themselves, learned once the track is confirmed and the
-    clocks' offset known; follows_walk: since then. learns: whether walks and shares are learned. wide: whether the
-    place was poorly known at the last picture. without: which nodes have no inertial unit now. turning_off: of each,
-    the lasting part (3,) of what its attitudes are off their prediction, in sigmas. by_shares (SIZE, 4): how the state
-    would be moved by a share of 1 of the samples' fast parts; shares: what the lights tell of them (vibration.py).
-    by_scale (SIZE,), scale: the same of a gap between both bars (scale.py).
-    attitude_s, depth_s: when attitudes and depths were last used. compasses: each node's heading as its last attitude
-    had it, minus the track's, rad, and the variance that it stated, rad^2.
+    learned from the lights' residuals; shaken (3, MOVING, MOVING), by_shaking (MOVING, 3): derivatives of the
+    covariance and of the state by the logs of its variances. walking: how much the units' biases walk, or the nodes
+    themselves, learned once the track is confirmed and the clocks' offset known; follows_walk: since then. learns:
+    whether walks and shares are learned. wide: whether the place was poorly known at the last picture. without: which
+    nodes have no inertial unit now. turning_off: of each, the lasting part (3,) of what its attitudes are off their
+    prediction, in sigmas. by_shares (SIZE, 4): how the state would be moved by a share of 1 of the samples' fast parts;
+    shares: what the lights tell of them (vibration.py). by_scale (SIZE,), scale: the same of a gap between both bars
+    (scale.py). attitude_s, depth_s: when attitudes and depths were last used. compasses: each node's heading as its
+    last attitude had it, minus the track's, rad, and the variance that it stated, rad^2.
 
     The lights: detection (2, 2): by observer and light, how often a light in the picture is found; shown (2, 2): how
     likely it was to be found at shown_s, by observer, after the last picture had told. last_seen (2,):
@@ -81,6 +81,7 @@ class Estimate:
     confirmed: bool = False
     shaking: Shaking = field(default_factory=Shaking)
     shaken: Floats = field(default_factory=lambda: np.zeros((3, MOVING, MOVING)))
+    by_shaking: Floats = field(default_factory=lambda: np.zeros((MOVING, 3)))
     walking: Walking = field(default_factory=Walking)
     learns: bool = True
     follows_walk: bool = False

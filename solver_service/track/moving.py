@@ -200,6 +200,7 @@ class TrackMoves(TrackIntake):
         Q, walk, shaken = process_noise(after, parts, noises, shaking, span_s, shares)
         onward = F[:, :MOVING]
         estimate.shaken = onward @ estimate.shaken @ onward.T + (learned / shaking)[:, None, None] * shaken
+        estimate.by_shaking = onward @ estimate.by_shaking
         if parts.by_fast is not None:
             by_shares = estimate.by_shares.copy()
             by_shares[:MOVING] = F @ estimate.by_shares + moved_by_shares(after, parts.by_fast)

@@ -224,6 +224,7 @@ class PathPass(TrackSteps):
             Q = told.Q + np.tensordot(learned + told.lost - 1.0, told.shaken, 1)
             onward = F[:, :MOVING]
             main.shaken = onward @ main.shaken @ onward.T + learned[:, None, None] * told.shaken
+            main.by_shaking = onward @ main.by_shaking
             main.covariance = predicted(main.covariance, F, Q, walk)
             main.t_s, main.rates_radps = at_s, told.rates_radps
         main.state = there

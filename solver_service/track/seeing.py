@@ -319,8 +319,11 @@ def told_by(
     if doubts is not None:
         moving = H[:, :MOVING]
         sure = without_doubts(S_inverse, doubts)
-        estimate.shaking = estimate.shaking.taught(y, sure, moving[:, :NAV], estimate.shaken[:, :NAV, :NAV])
+        by = estimate.shaken[:, :NAV, :NAV], estimate.by_shaking[:NAV]
+        estimate.shaking = estimate.shaking.taught(y, sure, moving[:, :NAV], *by)
         rest = _STILL - gain[:MOVING, others:] @ moving[others:]
+        pulled = estimate.shaken @ (moving[others:].T @ (S_inverse @ y)[others:])
+        estimate.by_shaking = rest @ (estimate.by_shaking + pulled.T)
         estimate.shaken = rest @ estimate.shaken @ rest.T
     return error, chi2
 

@@ -30,6 +30,9 @@ MOST: Final = np.log(np.array((0.03, 0.03, 0.3)) ** 2)
 # A picture's weight is halved after 200 more, which two nodes take in 10 s at 10 Hz: shaking comes and goes.
 KEPT: Final = 0.5 ** (1.0 / 200.0)
 LONGEST_STEP: Final = 0.5
+# Most units are screwed to their cameras. Where lights hardly tell a pair's shaking, it is taken to be small: each
+# picture takes so much off the likelihood's slope by the logs.
+CALM: Final = 0.02
 _SHORTEST: Final = math.exp(-LONGEST_STEP)
 # One residual's chi^2 counts at most so much: gross errors are no shaking.
 MOST_CHI2: Final = 9.0
@@ -46,19 +49,25 @@ def nothing_learned(count: int) -> Floats:
 
 
 def learned(
-    logs: Floats, information: Floats, slope: Floats, fisher: Floats, first_logs: Floats, kept: float
+    logs: Floats,
+    information: Floats,
+    slope: Floats,
+    fisher: Floats,
+    first_logs: Floats,
+    kept: float,
+    calm: float = 0.0,
 ) -> tuple[Floats, Floats]:
     """Go on by the likelihood's slope (n,) and its information (n, n), both by the logs (n,) of variances.
 
     information (2, n, n): what has been learned of the logs, and of the variances as shares of the first ones; kept: so
     much of it counts on. In calm times the logs gain little information, so that shaking which begins is believed at
     once. But by the logs alone, shaking that has ended would be believed for long. By the variances it is the other way
-    round. The longer of both steps is taken.
+    round. The longer of both steps is taken. calm: what is taken off the slope by the logs.
     """
     share = np.exp(logs - first_logs)
     both, slopes = np.empty_like(information), np.empty((2, len(logs), 1))
     both[0], both[1] = fisher, fisher / (share[:, None] * share)
-    slopes[0, :, 0], slopes[1, :, 0] = slope, slope / share
+    slopes[0, :, 0], slopes[1, :, 0] = slope - calm, slope / share
     information = kept * information + both + (1.0 - kept) * nothing_learned(len(logs))
     by_logs, by_shares = np.linalg.solve(information, slopes)[..., 0]
     by_shares = np.log(np.maximum(1.0 + by_shares / share, _SHORTEST))
@@ -94,20 +103,21 @@ class Shaking:
         left = 1.0 - np.array((shares[0, 1], shares[1, 1], shares[:, 0].min()))
         return Shaking(np.maximum(self.logs + 2.0 * np.log(np.maximum(left, LEAST_LEFT)), LEAST))
 
-    def taught(self, y: Floats, S_inverse: Floats, H: Floats, shaken: Floats) -> Shaking:
-        """Go on by one picture's residuals y (m,), H (m, NAV) and shaken (3, NAV, NAV), by Fisher's scoring.
+    def taught(self, y: Floats, S_inverse: Floats, H: Floats, shaken: Floats, moved: Floats) -> Shaking:
+        """Go on by one picture's residuals y (m,) and H (m, NAV), by Fisher's scoring.
 
-        With D_j = H shaken_j H^T = dS / dlogs_j the likelihood's slope is (z^T D_j z - tr(S^-1 D_j)) / 2, z = S^-1 y,
-        and its information tr(S^-1 D_j S^-1 D_k) / 2.
+        shaken (3, NAV, NAV), moved (NAV, 3): derivatives of covariance and state by the logs. With D_j = H shaken_j
+        H^T, u_j = H moved_j and z = S^-1 y the likelihood's slope is (z^T D_j z - tr(S^-1 D_j)) / 2 + z^T u_j, and its
+        information tr(S^-1 D_j S^-1 D_k) / 2 + u_j^T S^-1 u_k.
         """
         z = S_inverse @ y
         chi2 = float(y @ z)
         z = z * math.sqrt(min(1.0, MOST_CHI2 * len(y) / max(chi2, 1e-9)))
         D = H @ shaken @ H.T
-        W = S_inverse @ D
-        slope = 0.5 * (D @ z @ z - np.trace(W, axis1=1, axis2=2))
-        fisher = 0.5 * (W.reshape(3, -1) @ np.swapaxes(W, 1, 2).reshape(3, -1).T)
-        logs, information = learned(self.logs, self.information, slope, fisher, FIRST_LOGS, KEPT)
+        W, y_moved = S_inverse @ D, H @ moved
+        slope = 0.5 * (D @ z @ z - np.trace(W, axis1=1, axis2=2)) + y_moved.T @ z
+        fisher = 0.5 * (W.reshape(3, -1) @ np.swapaxes(W, 1, 2).reshape(3, -1).T) + y_moved.T @ S_inverse @ y_moved
+        logs, information = learned(self.logs, self.information, slope, fisher, FIRST_LOGS, KEPT, CALM)
         return Shaking(np.minimum(np.maximum(logs, LEAST), MOST), information)
 
 
