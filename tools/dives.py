@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import heapq
 import logging
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -23,7 +23,7 @@ from buddyline.protocol.config import ConfigError
 from buddyline.protocol.divelog import DiveLogReader
 from buddyline.protocol.envelope import Envelope, Refusals, read_message
 from buddyline.protocol.errors import BuddylineError, MessageError
-from buddyline.protocol.messages import Message, NodeInfo, Rejected, RelativePose
+from buddyline.protocol.messages import Message, NodeInfo, NodePose, Rejected, RelativePose, Track
 from buddyline.protocol.pictures import with_pictures
 from buddyline.protocol.topics import INFO, NET_POSE, TOPICS, Topic, parse_key
 from buddyline.tools import losses
@@ -36,6 +36,7 @@ M = TypeVar("M", bound=Message)
 
 _NAMES: Final = frozenset(topic.name for topic in TOPICS)
 _OUTCOMES: Final = (RelativePose, Rejected)
+_ROWS: Final = (Track, NodePose)
 
 
 @dataclass
@@ -143,14 +144,14 @@ class Dive:
     def messages(self, *topic_names: str, since_ns: int | None = None, doing: str = "") -> Iterator[Envelope]:
         """Yield the sound messages of these topics (none named: of all), by log time.
 
-        Of two outcomes of one trigger the first counts. since_ns: the least log time. doing: shows progress under
-        this name.
+        Of two outcomes of one trigger the first counts, and of two rows of a track, or of a node in a net, with one
+        stamp and mode. since_ns: the least log time. doing: shows progress under this name.
         """
         if not doing:
-            yield from self._first_outcomes(topic_names, since_ns)
+            yield from self._first_results(topic_names, since_ns)
             return
         with Progress(doing, self.seconds) as progress:
-            for envelope in self._first_outcomes(topic_names, since_ns):
+            for envelope in self._first_results(topic_names, since_ns):
                 progress.show((envelope.time_ns - self.start_ns) / S_NS)
                 yield envelope
 
@@ -160,11 +161,12 @@ class Dive:
             if isinstance(envelope.message, kind):
                 yield envelope.message
 
-    def _first_outcomes(self, topic_names: Iterable[str], since_ns: int | None) -> Iterator[Envelope]:
+    def _first_results(self, topic_names: Iterable[str], since_ns: int | None) -> Iterator[Envelope]:
         reading = _Pass()
         wanted = _wanted(topic_names)
         streams = [self._open(reader, wanted, since_ns, reading) for reader in self.readers]
         answered: set[tuple[tuple[str, ...], int]] = set()
+        rows_ns: dict[tuple[str, str], set[int]] = defaultdict(set)
         self._passes.append(reading)
         for envelope in heapq.merge(*streams, key=lambda envelope: envelope.time_ns):
             message = envelope.message
@@ -173,6 +175,11 @@ class Dive:
                     reading.repeated["/".join(envelope.ids)] += 1
                     continue
                 answered.add((envelope.ids, message.trigger))
+            elif isinstance(message, _ROWS):
+                of_mode = rows_ns[envelope.key, message.mode]
+                if message.stamp_ns in of_mode:
+                    continue
+                of_mode.add(message.stamp_ns)
             yield envelope
 
     def _open(

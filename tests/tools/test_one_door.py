@@ -1,5 +1,5 @@
 """All readers take messages through one door: what is on another node's key is believed by none, and of two outcomes
-of one trigger all take the first."""
+of one trigger, or two rows of one stamp, all take the first."""
 
 import csv
 import io
@@ -13,7 +13,7 @@ from buddyline.protocol.codec import encode
 from buddyline.protocol.divelog import DiveLogWriter
 from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.local_bus import LocalNetwork
-from buddyline.protocol.messages import Depth
+from buddyline.protocol.messages import Depth, NodePose
 from buddyline.protocol.topics import DEPTH, NODE_STATUS, key_of
 from buddyline.tools.cli import main
 from buddyline.tools.demo.dashboard import Dashboard
@@ -27,7 +27,7 @@ from buddyline.tools.monitor.summary import summarize
 from buddyline.tools.survey.live import LiveLegs, Watch
 from buddyline.tools.survey.readings import of_logs
 
-from tests.tools.evaluated import INFOS, PERIOD_NS, frame, pose, rejection, truth, write_log
+from tests.tools.evaluated import INFOS, PERIOD_NS, frame, pose, rejection, track, truth, write_log
 from tests.tools.watched import status
 
 ROOT = Path(__file__).parents[2]
@@ -130,6 +130,21 @@ def test_playback_and_report_refuse_a_depth_on_another_nodes_key(misplaced):
         assert dive.refused == 3
 
 
+def net_pose(k: int) -> NodePose:
+    return NodePose(
+        net="main",
+        node="a",
+        stamp_ns=NOW_NS + k * PERIOD_NS,
+        p_m=(0.0, 0.0, 0.0),
+        q_xyzw=(0.0, 0.0, 0.0, 1.0),
+        v_mps=(0.0, 0.0, 0.0),
+        covariance=[0.0] * 36,
+        fixed=True,
+        mode="filter",
+        age_s=0.0,
+    )
+
+
 @pytest.fixture
 def doubled(tmp_path):
     """Two solvers' log: triggers 0 and 1 are solved twice, 2 is solved and then rejected, 3 the other way round."""
@@ -168,6 +183,23 @@ def test_of_two_outcomes_of_a_trigger_report_view_and_survey_take_the_first(doub
     (readings,) = of_logs([doubled])
     assert (len(readings.triggers), len(readings.rejected)) == (3, 1)
     assert readings.t_a_b_m[:, 2].tolist() == [3.0, 3.0, 3.0]
+
+
+def test_rows_of_a_track_or_net_that_a_second_solver_repeats_count_once(tmp_path, capsys):
+    rows = [track(k, mode=mode) for k in range(4) for mode in ("filter", "lag")]
+    later = [track(k, (0.0, 0.0, 9.0), mode=mode) for k in range(4) for mode in ("filter", "lag")]
+    inputs = [*INFOS.values(), *(truth(k) for k in range(4)), pose(0), pose(3)]
+    log = write_log(tmp_path / "o.mcap", *inputs, *rows, *later, *(net_pose(k) for k in (0, 1, 0, 1)))
+    assert main(["evaluate", log, "--pair", "a/b", "--json"]) == 0
+    tracks = json.loads(capsys.readouterr().out)["tracks"]
+    assert [(one["mode"], one["samples"], one["wrong"], one["covered"]) for one in tracks] == [
+        ("filter", 4, 0, 1.0),
+        ("lag", 4, 0, 1.0),
+    ]
+    with Dive([log]) as dive:
+        assert len(list(dive.messages("track"))) == len(list(dive.messages("track_lag"))) == 4
+        assert len(list(dive.messages("net_pose"))) == 2
+        assert dive.repeated == {}
 
 
 def test_the_first_outcome_is_the_first_by_time_whatever_the_logs(tmp_path):
