@@ -25,6 +25,7 @@ from buddyline.protocol.salvage import (
     MAGIC,
     MAX_RECORD_BYTES,
     ChunkAt,
+    joined_at,
     read_chunk,
     summary_is_sound,
     walk,
@@ -377,6 +378,13 @@ class DiveLogReader:
     def _scan(self) -> _Contents:
         """Find the chunks of a log by reading through it; damaged parts are skipped."""
         contents = self._contents = _Contents()
+        joined = joined_at(self._file, self._size)
+        if joined is not None:
+            self._note(
+                f"another log begins at byte {joined}: its {self._size - joined} bytes are not read; "
+                "give the command the files that were joined"
+            )
+            self._size = joined
         declared: list[object] = []
         for found in walk(self._file, self._size, self._note):
             if isinstance(found, ChunkAt):

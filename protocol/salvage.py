@@ -89,8 +89,20 @@ def walk(file: IO[bytes], size: int, note: Callable[[str], None]) -> Iterator[Fo
             file.seek(offset)
             if file.read(len(MAGIC)) != MAGIC:
                 note(f"ends at byte {size} without having been closed")
+            elif file.tell() < size:
+                note(f"the {size - file.tell()} bytes after the log's end at byte {file.tell()} are not read")
             return
     note(f"ends at byte {size} without having been closed")
+
+
+def joined_at(file: IO[bytes], size: int) -> int | None:
+    """Return the byte at which another log begins that was joined to the first one; None if there is none.
+
+    No record of ours has a log's first bytes in it (see protocol.parity for those that are nearly copies).
+    """
+    with mmap.mmap(file.fileno(), size, access=mmap.ACCESS_READ) as data:
+        found = data.find(MAGIC + bytes([Opcode.HEADER]), len(MAGIC))
+    return None if found < 0 else found
 
 
 def record_at(file: IO[bytes], offset: int, size: int) -> tuple[int, Found | None, bool]:
@@ -107,6 +119,8 @@ def record_at(file: IO[bytes], offset: int, size: int) -> tuple[int, Found | Non
         raise MalformedError("ends within a record")
     if length > MAX_RECORD_BYTES:
         raise MalformedError(f"a record of {length} bytes")
+    if opcode == Opcode.FOOTER and length != _FOOTER.size - _HEAD_BYTES:
+        raise MalformedError(f"a footer of {length} bytes")
     if opcode == Opcode.CHUNK:
         return end, _chunk_at(file, offset, length), False
     if opcode not in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):

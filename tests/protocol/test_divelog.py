@@ -180,6 +180,52 @@ def test_a_damaged_index_hides_no_chunk(tmp_path):
             assert ticks_of(damaged) == list(range(50))
 
 
+@pytest.mark.parametrize("cut", ["nowhere", "in its end", "in its index", "in a chunk"])
+def test_of_two_logs_in_one_file_the_first_is_read_and_the_second_named(tmp_path, cut):
+    write(tmp_path / "a.mcap", range(50))
+    write(tmp_path / "b.mcap", range(100, 300), node="b")
+    first, second = (tmp_path / "a.mcap").read_bytes(), (tmp_path / "b.mcap").read_bytes()
+    with DiveLogReader(tmp_path / "a.mcap") as reader:
+        last_chunk = max(offset for _, _, offset, _ in reader._contents.chunks)
+    size = {
+        "nowhere": len(first),
+        "in its end": len(first) - 3,
+        "in its index": len(first) - 200,
+        "in a chunk": last_chunk + 90,
+    }[cut]
+    (tmp_path / "both.mcap").write_bytes(first[:size] + second)
+    for trust_index in (True, False):
+        with DiveLogReader(tmp_path / "both.mcap", trust_index=trust_index) as reader:
+            found = [record.open().message for record in reader.records()]
+            assert found == [depth(tick) for tick in range(40 if cut == "in a chunk" else 50)]
+            (said,) = [line for line in reader.damage if "another log" in line]
+            assert f"begins at byte {size}: its {len(second)} bytes are not read" in said
+            assert len(reader.damage) == (1 if cut == "nowhere" else 2)
+
+
+def test_bytes_after_the_end_of_a_log_are_named(tmp_path):
+    write(tmp_path / "a.mcap", range(50))
+    size = (tmp_path / "a.mcap").stat().st_size
+    with open(tmp_path / "a.mcap", "ab") as file:
+        file.write(random.Random(4).randbytes(1000))
+    with DiveLogReader(tmp_path / "a.mcap") as reader:
+        assert ticks_of(reader) == list(range(50))
+        assert reader.damage == [f"the 1000 bytes after the log's end at byte {size} are not read"]
+
+
+def test_a_chunk_whose_kind_became_that_of_the_end_costs_only_itself(tmp_path):
+    write(tmp_path / "a.mcap", range(50))
+    data = bytearray((tmp_path / "a.mcap").read_bytes())
+    with DiveLogReader(tmp_path / "a.mcap") as reader:
+        offset = sorted(reader._contents.chunks)[1][2]
+    # The kind of a log's last record.
+    data[offset] = 2
+    (tmp_path / "a.mcap").write_bytes(data)
+    with DiveLogReader(tmp_path / "a.mcap", trust_index=False) as reader:
+        assert ticks_of(reader) == [*range(10), *range(20, 50)]
+        assert reader.damage
+
+
 @pytest.mark.parametrize(
     ("content", "says"), [(b"", "is empty"), (b"just some text\n", "not a dive log"), (None, "cannot be read")]
 )
