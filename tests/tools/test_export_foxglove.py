@@ -234,6 +234,47 @@ def test_a_track_moves_b_and_draws_its_path(tmp_path: Path) -> None:
         assert "/pair/a/b/path" not in {c.topic for _, c, _ in make_reader(file).iter_messages()}
 
 
+def test_b_s_rig_lies_on_its_path_whatever_a_s_compass_says(tmp_path: Path) -> None:
+    """A's attitude is 5 degrees off what the track took from both compasses, and A goes down."""
+    from mcap.reader import make_reader
+
+    off = (0.0, 0.0, np.sin(np.radians(2.5)), np.cos(np.radians(2.5)))
+    messages: list[Message] = list(INFOS.values())
+    for k in range(25):
+        x, y, z = 0.1 * k, -0.05 * k, 3.0
+        now = [attitude("a", at(k), off), depth("a", at(k), 12.5 + 0.02 * k)]
+        messages += [*now, pose(k), track(k, (x, y, z), t_ned_m=(z, x, y))]
+    dive, output = write_log(tmp_path / "dive.mcap", *messages), tmp_path / "foxglove.mcap"
+    assert main(["export", dive, "--format", "foxglove", "-o", str(output)]) == 0
+    newest: dict[str, Any] = {}
+    drawn: dict[int, tuple[float, float, float]] = {}
+    rig: dict[int, np.ndarray[Any, Any]] = {}
+    with open(output, "rb") as file:
+        reader = make_reader(file, decoder_factories=[decoding.DecoderFactory(), JsonDecoder()])
+        for _, channel, record, message in reader.iter_decoded_messages(log_time_order=False):
+            if channel.topic == "/tf":
+                newest |= {t.child_frame_id: t for t in message.transforms}
+                if len(newest) == 2:
+                    a, b = newest["a_camera"], newest["b_camera"]
+                    in_a = matrix(a.rotation) @ (b.translation.x, b.translation.y, b.translation.z)
+                    rig[record.log_time] = np.add(in_a, (a.translation.x, a.translation.y, a.translation.z))
+            elif channel.topic == "/pair/a/b/path":
+                (piece,) = message.entities
+                first = piece.timestamp.seconds * 10**9 + piece.timestamp.nanos
+                drawn |= {first + at(k) - at(0): (p.x, p.y, p.z) for k, p in enumerate(piece.lines[0].points)}
+    assert len(rig) == len(drawn) == 25
+    for stamp_ns, place in drawn.items():
+        np.testing.assert_allclose(rig[stamp_ns], place, atol=1e-9)
+    # Without a track A stands by its own compass.
+    poses = tmp_path / "poses.mcap"
+    assert main(["export", dive, "--format", "foxglove", "--what", "poses", "-o", str(poses)]) == 0
+    with open(poses, "rb") as file:
+        reader = make_reader(file, decoder_factories=[decoding.DecoderFactory(), JsonDecoder()])
+        told = [t for _, c, _, tf in reader.iter_decoded_messages() if c.topic == "/tf" for t in tf.transforms]
+    ahead = matrix([t for t in told if t.child_frame_id == "a_camera"][-1].rotation) @ (0.0, 0.0, 1.0)
+    assert np.degrees(np.arctan2(ahead[0], ahead[1])) == pytest.approx(5.0)
+
+
 def test_each_frame_of_a_team_has_one_parent(tmp_path: Path) -> None:
     from mcap.reader import make_reader
 

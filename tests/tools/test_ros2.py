@@ -155,6 +155,28 @@ def test_transforms_lead_from_the_map_to_b(store: Any) -> None:
     np.testing.assert_allclose(b_m, (3.0, 0.0, -12.5), atol=1e-9)
 
 
+def test_the_chain_leads_to_where_the_track_says_that_b_is_and_not_by_a_s_compass_alone(store: Any) -> None:
+    """A's attitude says east, its track that the other compass has B in the north-east, and deeper."""
+    ahead = track(1, (0.0, 0.0, 3.0), t_ned_m=(2.0, 2.0, 1.0))
+    behind = track(2, (0.0, 0.0, 3.0), t_ned_m=(0.0, -3.0, 0.0))
+    other = replace(track(2, (0.0, 0.0, 3.0), t_ned_m=(3.0, 0.0, 0.0)), node_b="c")
+    told = [INFOS["a"], depth("a", at(0)), attitude("a", at(0), EAST), attitude("a", at(1), EAST), ahead]
+    said = translated(store, *told, depth("a", at(2), 13.0), attitude("a", at(2), EAST), other, behind)
+    chain = [t for one in said if one.topic == "/tf" for t in one.value.transforms]
+    in_map = {t.header.stamp.nanosec: t.transform for t in chain if t.header.frame_id == MAP}
+    assert len([t for t in chain if t.header.frame_id == MAP]) == len(in_map) == 2
+    placed = in_map[at(1) % S_NS]
+    np.testing.assert_allclose(turned(placed.rotation, (0.0, 0.0, 3.0)), (2.0, 2.0, -1.0), atol=1e-9)
+    # Turned by no more than is needed: about the axis between both directions.
+    axis = np.cross((3.0, 0.0, 0.0), (2.0, 2.0, -1.0))
+    untouched = quat_to_matrix(np.array([0.5, -0.5, 0.5, -0.5]))
+    assert axis @ turned(placed.rotation, untouched.T @ axis) == pytest.approx(axis @ axis)
+    assert placed.translation.z == -12.5
+    # An opposite direction tells no axis: A's attitude stays.
+    np.testing.assert_allclose(turned(in_map[at(2) % S_NS].rotation, (0.0, 0.0, 3.0)), (3.0, 0.0, 0.0), atol=1e-9)
+    assert in_map[at(2) % S_NS].translation.z == -13.0
+
+
 def links(said: list[RosMessage]) -> list[tuple[str, str]]:
     """Return parent and child of each transform."""
     return [(t.header.frame_id, t.child_frame_id) for one in said if one.topic == "/tf" for t in one.value.transforms]

@@ -1,7 +1,8 @@
 """A dive as Foxglove's own messages, which Foxglove, Lichtblick and rerun draw without any set-up.
 
 World is east, north, up with its origin on the surface above A, or at A where no depth is known. A stands in it by
-its attitude and depth, and B in A's camera frame by the track, or by the poses where there is no track. Nodes of a net
+its attitude and depth, and B in A's camera frame by the track, or by the poses where there is no track. A track takes
+north from both compasses: A is then turned so that B is where the track says, north-east-down. Nodes of a net
 stand in the net's frame (`net_main`, here east, north, up), which is as deep in the world as a node of it says. A
 node's path is a line: of its places in the net, or of the track's in north-east-down, as seen from A. All rigs are a
 scene; what nodes and solver report, and why a trigger gave no pose, is a log. For plots the log's own messages follow,
@@ -74,7 +75,7 @@ class FoxgloveTranslation:
         self._tracked = set(tracked)
         self._nets = nets
         self._depths = NetDepths()
-        self._paths: dict[tuple[str, str], list[Track]] = {}
+        self._paths: dict[tuple[str, str], list[tuple[Track, Any]]] = {}
         self._net_paths: dict[tuple[str, str], list[NodePose]] = {}
         self._frames: dict[str, deque[Candidates]] = {}
         self._camera = BaseCamera()
@@ -153,11 +154,13 @@ class FoxgloveTranslation:
         return fox.SceneUpdate(entities=[entity])
 
     def _attitude(self, attitude: Attitude) -> Iterator[tuple[str, int, Any]]:
-        node, stamp_ns = attitude.node, attitude.stamp_ns
-        R = self._camera.orientation(attitude)
-        if R is not None and node not in self._nets:
-            position_m = self._camera.position_m(node)
-            yield TRANSFORMS, stamp_ns, self._transform(WORLD, f"{node}_camera", position_m, R, stamp_ns)
+        yield from self._base(attitude.node, attitude.stamp_ns, self._camera.orientation(attitude))
+
+    def _base(self, node: str, stamp_ns: int, R_enu_camera: Any) -> Iterator[tuple[str, int, Any]]:
+        """Yield the transform of the node that stands in the world; R_enu_camera: None for none."""
+        if R_enu_camera is not None and node not in self._nets:
+            position_m = self._camera.position_m(node, stamp_ns)
+            yield TRANSFORMS, stamp_ns, self._transform(WORLD, f"{node}_camera", position_m, R_enu_camera, stamp_ns)
 
     def _image(self, node: str, image: CompressedImage) -> Iterator[tuple[str, int, Any]]:
         stamp_ns = image.stamp_ns
@@ -225,11 +228,12 @@ class FoxgloveTranslation:
         t_m, R = np.array(track.t_a_b_m), quat_to_matrix(np.array(track.q_a_b_xyzw))
         if self._places(track):
             yield TRANSFORMS, track.stamp_ns, self._transform(base, child, t_m, R, track.stamp_ns)
+            yield from self._base(track.node_a, track.stamp_ns, self._camera.tracked(track))
         piece = self._paths.setdefault((track.node_a, track.node_b), [])
-        piece.append(track)
-        if track.stamp_ns - piece[0].stamp_ns >= PATH_NS:
+        piece.append((track, self._camera.position_m(track.node_a, track.stamp_ns)))
+        if track.stamp_ns - piece[0][0].stamp_ns >= PATH_NS:
             yield self._path(piece)
-            piece[:] = [track]
+            del piece[:-1]
 
     def _node_pose(self, pose: NodePose) -> Iterator[tuple[str, int, Any]]:
         """Yield a node's pose in its net's frame, the transform, and how deep the net's frame is."""
@@ -261,16 +265,19 @@ class FoxgloveTranslation:
             if len(in_net) > 1:
                 yield self._net_path(in_net)
 
-    def _path(self, piece: list[Track]) -> tuple[str, int, Any]:
-        """Return a piece of B's path: in the world if A's attitude is known, else in A's camera frame."""
-        first = piece[0]
-        known = [one.t_ned_m for one in piece if one.t_ned_m is not UNSET]
+    def _path(self, piece: list[tuple[Track, Any]]) -> tuple[str, int, Any]:
+        """Return a piece of B's path: in the world if A's attitude is known, else in A's camera frame.
+
+        piece: rows of the track, each with A's place.
+        """
+        first, last = piece[0][0], piece[-1][0]
+        known = [R_ENU_NED @ np.array(one.t_ned_m) + at_m for one, at_m in piece if one.t_ned_m is not UNSET]
         if len(known) == len(piece):
-            frame, points_m = WORLD, np.array(known) @ R_ENU_NED.T + self._camera.position_m(first.node_a)
+            frame, points_m = WORLD, np.array(known)
         else:
-            frame, points_m = f"{first.node_a}_camera", np.array([one.t_a_b_m for one in piece])
+            frame, points_m = f"{first.node_a}_camera", np.array([one.t_a_b_m for one, _ in piece])
         scene = self._line(frame, f"path {first.stamp_ns}", first.stamp_ns, points_m)
-        return f"/pair/{first.node_a}/{first.node_b}/path", piece[-1].stamp_ns, scene
+        return f"/pair/{first.node_a}/{first.node_b}/path", last.stamp_ns, scene
 
     def _net_path(self, piece: list[NodePose]) -> tuple[str, int, Any]:
         """Return a piece of a node's path in its net's frame."""

@@ -103,10 +103,7 @@ class _Drawing:
         if isinstance(message, NodeInfo | Depth):
             self._camera.take(message)
         elif isinstance(message, Attitude):
-            R = self._camera.orientation(message)
-            if R is not None and message.node not in self._nets:
-                at_m = self._camera.position_m(message.node)
-                self._log(self._eye(message.node), rr.Transform3D(translation=at_m, mat3x3=R))
+            self._stand(message.node, message.stamp_ns, self._camera.orientation(message))
         elif isinstance(message, CompressedImage):
             node = message.frame_id.removesuffix("_camera")
             picture = rr.EncodedImage(contents=message.data, media_type=f"image/{message.format}")
@@ -137,6 +134,12 @@ class _Drawing:
         if up_m is not None:
             self._log(net, rr.Transform3D(translation=(0.0, 0.0, up_m)))
 
+    def _stand(self, node: str, stamp_ns: int, R_enu_camera: Any) -> None:
+        """Draw where A stands in the world; R_enu_camera: None for nothing."""
+        if R_enu_camera is not None and node not in self._nets:
+            at_m = self._camera.position_m(node, stamp_ns)
+            self._log(self._eye(node), self._rr.Transform3D(translation=at_m, mat3x3=R_enu_camera))
+
     def _place(self, estimate: Track | RelativePose) -> None:
         # An entity has one place in the tree: of other pairs than A's nothing is drawn.
         if estimate.node_a != self._base or estimate.node_b in self._nets:
@@ -144,9 +147,11 @@ class _Drawing:
         rr = self._rr
         turn = rr.Quaternion(xyzw=estimate.q_a_b_xyzw)
         self._log(self._eye(estimate.node_b), rr.Transform3D(translation=estimate.t_a_b_m, quaternion=turn))
+        if isinstance(estimate, Track):
+            self._stand(estimate.node_a, estimate.stamp_ns, self._camera.tracked(estimate))
         if not isinstance(estimate.t_ned_m, msgspec.UnsetType):
             north_m, east_m, down_m = estimate.t_ned_m
-            at_m = self._camera.position_m(estimate.node_a) + np.array((east_m, north_m, -down_m))
+            at_m = self._camera.position_m(estimate.node_a, estimate.stamp_ns) + np.array((east_m, north_m, -down_m))
             self._log(f"world/trail_{estimate.node_b}", rr.Points3D([at_m], colors=_rgb(OTHER), radii=0.02))
 
     def _rig(self, info: NodeInfo) -> None:

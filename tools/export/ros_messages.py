@@ -205,10 +205,13 @@ class Translation:
 
     def _camera_in_map(self, attitude: Attitude) -> Iterator[RosMessage]:
         """Yield the transform of A's camera. B's follows from the pose, because a frame has only one parent."""
-        R = self._camera.orientation(attitude)
-        if R is not None and self._tree.parent(attitude.node, attitude.stamp_ns) is None:
-            x, y, z = self._camera.position_m(attitude.node).tolist()
-            yield self._transform(attitude.stamp_ns, MAP, f"{name_of(attitude.node)}_camera", (x, y, z), R)
+        yield from self._base(attitude.node, attitude.stamp_ns, self._camera.orientation(attitude))
+
+    def _base(self, node: str, stamp_ns: int, R_enu_camera: Any) -> Iterator[RosMessage]:
+        """Yield the transform of the node that stands in the map; R_enu_camera: None for none."""
+        if R_enu_camera is not None and self._tree.parent(node, stamp_ns) is None:
+            x, y, z = self._camera.position_m(node, stamp_ns).tolist()
+            yield self._transform(stamp_ns, MAP, f"{name_of(node)}_camera", (x, y, z), R_enu_camera)
 
     def _depth(self, depth: Depth) -> RosMessage:
         variances = np.full(6, UNKNOWN_VARIANCE)
@@ -245,6 +248,7 @@ class Translation:
             self._tracked_ns[a, b] = track.stamp_ns
             yield self._range(track)
             yield from self._placed(track, R_a_b)
+            yield from self._base(track.node_a, track.stamp_ns, self._camera.tracked(track))
 
     def _placed(self, estimate: Track | RelativePose, R_a_b: Any) -> Iterator[RosMessage]:
         """Yield B's transform from A's camera, unless the net or another pair places B; A's root stands in the map."""
