@@ -22,7 +22,7 @@ MAX_VALUE_LENGTH: Final = 60
 M = TypeVar("M", bound=Message)
 
 
-def _plain(value: object) -> object:
+def plain(value: object) -> object:
     """Convert numpy scalars and arrays to Python's numbers and lists."""
     to_list = getattr(value, "tolist", None)
     if to_list is None:
@@ -30,7 +30,7 @@ def _plain(value: object) -> object:
     return to_list()
 
 
-_ENCODER = msgspec.json.Encoder(enc_hook=_plain)
+_ENCODER = msgspec.json.Encoder(enc_hook=plain)
 _DECODERS: dict[type[Message], msgspec.json.Decoder[Any]] = {}
 
 

@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 
 import msgspec
+from buddyline.protocol.codec import plain
 from buddyline.protocol.messages import Message
 
 log = logging.getLogger(__name__)
@@ -47,7 +48,7 @@ class StatusFile:
         fresh = self.path.with_name(f".{self.path.name}.{os.getpid()}")
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            fresh.write_bytes(msgspec.json.encode(content) + b"\n")
+            fresh.write_bytes(msgspec.json.encode(content, enc_hook=plain) + b"\n")
             fresh.replace(self.path)
         except OSError as error:
             if not self._failed:

@@ -84,7 +84,7 @@ def clock_now(track: TrackFilter) -> tuple[float, float] | None:
     main = track.main
     if main is None or not main.confirmed or any(main.without):
         return None
-    return track.clock_ns / S_NS + main.state.clock_s, math.sqrt(main.covariance[CLOCK, CLOCK])
+    return track.clock_ns / S_NS + float(main.state.clock_s), math.sqrt(main.covariance[CLOCK, CLOCK])
 
 
 def _stretches(records: Records, fixes: Sequence[FixSeen]) -> Iterator[tuple[Records, list[FixSeen]]]:

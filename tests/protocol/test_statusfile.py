@@ -3,10 +3,12 @@
 import json
 import logging
 
+import numpy as np
 import pytest
 from buddyline.protocol.codec import decode
 from buddyline.protocol.messages import NodeStatus
 from buddyline.protocol.statusfile import StatusFile
+from msgspec.structs import replace
 
 STATUS = NodeStatus(
     node="a", stamp_ns=5, boot="b", software="s", uptime_s=1.0, rates_hz={}, drops={}, ages_s={}, problem="disk: full"
@@ -44,6 +46,13 @@ def test_the_status_file_is_always_complete_and_removed_at_the_end(tmp_path):
     file.remove()
     assert not file.path.exists()
     file.remove()
+
+
+def test_numbers_of_numpy_end_no_service(tmp_path):
+    """On the bus they are sent as Python's; the file must not be stricter."""
+    file = StatusFile(tmp_path / "solver.json")
+    file.write("solver", [], replace(STATUS, uptime_s=np.float64(1.5)))
+    assert json.loads(file.path.read_bytes())["status"]["uptime_s"] == 1.5
 
 
 def test_a_path_that_cannot_be_written_is_reported_once(tmp_path, caplog):

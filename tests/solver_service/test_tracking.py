@@ -4,6 +4,7 @@ import random
 import re
 from itertools import groupby
 
+import msgspec
 import numpy as np
 import pytest
 from buddyline.protocol.clock import S_NS
@@ -214,6 +215,14 @@ def test_live_tracks_go_by_their_own_topics_on_a_grid_of_their_rate(inertial_div
         stamps_ns = [one.stamp_ns for one in tracks if one.mode == mode]
         assert {stamp_ns % 40_000_000 for stamp_ns in stamps_ns} == {0}
         assert stamps_ns == sorted(set(stamps_ns))
+
+
+def test_the_clocks_offset_in_a_live_status_is_a_plain_number(inertial_dive):
+    """As numpy's it ended each solver that writes a status file."""
+    _, solver = tracks_of(inertial_dive[0], "filter")
+    status = solver.pairs["a", "b"].report(0, 0, [], 0, [])
+    assert type(status.clock_skew_s) is float
+    assert msgspec.json.encode(status)
 
 
 def test_angles_to_north_need_an_attitude():
