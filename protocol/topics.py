@@ -217,7 +217,14 @@ TRACK: Final = Topic(
 )
 # After TRACK, because topic_of returns the first topic of a schema (and this one for the mode `lag`).
 TRACK_LAG: Final = Topic(
-    "track_lag", "buddyline/pair/{a}/{b}/track_lag", messages.Track, 20.0, "data", stale_s=3.0, solved=True
+    "track_lag",
+    "buddyline/pair/{a}/{b}/track_lag",
+    messages.Track,
+    20.0,
+    "data",
+    stale_s=3.0,
+    retained=True,
+    solved=True,
 )
 TRUTH: Final = Topic("truth", "buddyline/pair/{a}/{b}/truth", messages.Truth, 10.0, "data_low")
 NET_POSE: Final = Topic(

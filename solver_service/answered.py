@@ -1,16 +1,18 @@
-"""Outcomes that an earlier solver has published, so that a restarted solver does not publish them again."""
+"""What an earlier solver has published, so that a restarted one does not publish it again: outcomes, tracks, nets."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Final
 
 import msgspec
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.messages import Message, Rejected, RelativePose
+from buddyline.protocol.messages import Message, NodePose, Rejected, RelativePose, Track
+from buddyline.protocol.topics import TRACK, TRACK_LAG, key_of
 
 Outcome = RelativePose | Rejected
+Row = Track | NodePose
 
 MAX_WITHHELD: Final = 8192
 # Longer than a prediction is valid, and longer than the solver waits for a sensor.
@@ -19,6 +21,10 @@ WARM_UP_NS: Final = 10 * S_NS
 HANDED_OVER_NS: Final = 2 * S_NS
 # An answer this near to the present is of the live dive, of which there is one. A stored dive may come again.
 THIS_DIVE_NS: Final = 600 * S_NS
+# When a solver ends, its tracks' last rows are up to so long after its last answer.
+ROWS_AHEAD_NS: Final = 2 * S_NS
+# A track's rows were published up to so long before the last answer: it waits 3 s for a sensor, `track_lag` 1 s more.
+ROWS_BEHIND_NS: Final = 5 * S_NS
 
 
 class Answer(msgspec.Struct, frozen=True):
@@ -67,11 +73,12 @@ def by_pair(outcomes: Iterable[Answer]) -> dict[tuple[str, str], list[Answer]]:
 
 
 class Answered:
-    """Withholds outcomes that were published before, for all pairs. said: the last published outcomes of each pair."""
+    """Withholds what was published before, of all pairs and nets. said: the last published outcomes of each pair."""
 
     def __init__(self, said: Iterable[Answer] = ()) -> None:
         self._said: dict[tuple[str, str], list[Answer]] = {}
         self._pairs: dict[tuple[str, str], AnsweredPair] = {}
+        self._rows = ToldRows()
         self.know(said)
 
     def know(self, said: Iterable[Answer]) -> None:
@@ -79,13 +86,40 @@ class Answered:
         for outcome in said:
             self._said.setdefault((outcome.node_a, outcome.node_b), []).append(outcome)
 
+    def know_rows(self, held: Iterable[Row]) -> None:
+        """Take the last rows that were published before, as the hub holds them; `know` comes first.
+
+        A track's rows some seconds before its pair's last answer were published, also if the hub holds none.
+        """
+        answered = {nodes: self.pair(nodes).up_to_ns for nodes in [*self._said, *self._pairs]}
+        told_ns = {
+            topic.key(*nodes): up_to_ns - ROWS_BEHIND_NS
+            for nodes, up_to_ns in answered.items()
+            for topic in (TRACK, TRACK_LAG)
+        }
+        last_ns = max(answered.values(), default=0)
+        for row in held:
+            up_to_ns = answered.get((row.node_a, row.node_b), 0) if isinstance(row, Track) else last_ns
+            # One that no solver of this dive can have published would silence the track for as long as its stamp says.
+            if row.stamp_ns <= up_to_ns + ROWS_AHEAD_NS:
+                told_ns[key_of(row)] = max(row.stamp_ns, told_ns.get(key_of(row), 0))
+        self._rows.know(told_ns)
+
     def unsaid(self, messages: Iterable[Message]) -> list[Message]:
-        """Return the messages without those outcomes that were published before."""
-        return [
-            message
-            for message in messages
-            if not isinstance(message, Outcome) or self.pair((message.node_a, message.node_b)).is_due(message)
-        ]
+        """Return the messages without those outcomes and rows that were published before."""
+        due: list[Message] = []
+        for message in messages:
+            if isinstance(message, Row):
+                due += [message] if self._rows.is_due(message) else []
+                continue
+            if isinstance(message, Outcome):
+                pair = self.pair((message.node_a, message.node_b))
+                if not pair.is_due(message):
+                    continue
+                if pair.is_of_another_dive(message):
+                    due += self._rows.release()
+            due.append(message)
+        return due
 
     def is_over(self, pairs: Iterable[tuple[str, str]], stamp_ns: int, now_ns: int) -> bool:
         """Return whether a frame from a cache need not be solved: the dive is live, and it is before the answers.
@@ -96,8 +130,15 @@ class Answered:
         return bool(known) and all(known)
 
     def saw_new_frame(self, pairs: Iterable[tuple[str, str]], trigger: int, stamp_ns: int) -> list[Message]:
-        """Note a frame that was sent after this solver joined; return withheld outcomes to publish now."""
-        return [outcome for nodes in pairs for outcome in self.pair(nodes).saw_new_frame(trigger, stamp_ns)]
+        """Note a frame that was sent after this solver joined; return what was withheld and is to be published now."""
+        due: list[Message] = []
+        for nodes in pairs:
+            pair = self.pair(nodes)
+            knew = pair.knows
+            due += pair.saw_new_frame(trigger, stamp_ns)
+            if knew and not pair.knows:
+                due += self._rows.release()
+        return due
 
     def take_over(self, nodes: tuple[str, str], said: Iterable[Answer]) -> int:
         """Go on with a pair that another solver had; return the time of that one's last answer, 0 for none."""
@@ -109,6 +150,40 @@ class Answered:
         if nodes not in self._pairs:
             self._pairs[nodes] = AnsweredPair(self._said.pop(nodes, ()))
         return self._pairs[nodes]
+
+
+class ToldRows:
+    """Withholds the rows of tracks and nets that were published before: by key, all up to one stamp.
+
+    The rows of a key come in the order of their stamps. If the dive turns out to be another one, they are published.
+    """
+
+    def __init__(self) -> None:
+        self._told_ns: dict[str, int] = {}
+        self._withheld: dict[str, deque[Row]] = {}
+
+    def know(self, told_ns: Mapping[str, int]) -> None:
+        """Take the stamps up to which the rows of keys were published."""
+        self._told_ns |= told_ns
+
+    def is_due(self, row: Row) -> bool:
+        """Return whether a row is to be published; if not, withhold it."""
+        if not self._told_ns:
+            return True
+        key = key_of(row)
+        if row.stamp_ns <= self._told_ns.get(key, -1):
+            self._withheld.setdefault(key, deque(maxlen=MAX_WITHHELD)).append(row)
+            return False
+        self._told_ns.pop(key, None)
+        self._withheld.pop(key, None)
+        return True
+
+    def release(self) -> list[Row]:
+        """Return the withheld rows, and withhold none any more."""
+        due = [row for rows in self._withheld.values() for row in rows]
+        self._told_ns.clear()
+        self._withheld.clear()
+        return due
 
 
 class AnsweredPair:
@@ -131,6 +206,19 @@ class AnsweredPair:
         # Without an answer, though later triggers have one.
         self._open: set[int] = set()
         self._withheld: deque[Outcome] = deque(maxlen=MAX_WITHHELD)
+
+    @property
+    def knows(self) -> bool:
+        """Whether triggers of this dive were answered before."""
+        return self._up_to is not None
+
+    def is_of_another_dive(self, outcome: Outcome) -> bool:
+        """Return whether an outcome's trigger is after all that were answered, and its stamp a second before the last.
+
+        The dive before had another rate of triggers.
+        """
+        after = self._up_to is not None and outcome.trigger > self._up_to
+        return after and answer_of(outcome).in_order and outcome.stamp_ns < self.up_to_ns - S_NS
 
     def expect(self, triggers: Iterable[int], noted: Iterable[Answer]) -> set[int]:
         """Return those triggers that have no answer; from now on each is due, also before later ones that have one.

@@ -28,11 +28,13 @@ from buddyline.protocol.topics import (
     NET_POSE,
     POSE,
     REJECTED,
+    TRACK,
+    TRACK_LAG,
     Topic,
     key_of,
     parse_key,
 )
-from buddyline.solver_service.answered import THIS_DIVE_NS, Answer, Answered, Outcome, answer_of, said_of
+from buddyline.solver_service.answered import THIS_DIVE_NS, Answer, Answered, Outcome, Row, answer_of, said_of
 from buddyline.solver_service.config import SolverConfig
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.journal import Journal, Noted
@@ -252,6 +254,7 @@ class SolverService(Service):
         if self._work is None:
             past, said = self._read_past(bus)
             self._answered.know(said)
+            self._answered.know_rows(_rows_held_by(bus))
             self._owed.expect(past)
             for one in said:
                 up_to_ns = self._answered.pair((one.node_a, one.node_b)).up_to_ns
@@ -452,6 +455,15 @@ def _pulse(work: SharedWork, stop: threading.Event) -> None:
 
 def _held_by(bus: Bus) -> list[Answer]:
     """Return the last outcome of each pair that earlier solvers have published, as kept by the hub."""
+    return [answer_of(message) for message in _held(bus, POSE, REJECTED) if isinstance(message, Outcome)]
+
+
+def _rows_held_by(bus: Bus) -> list[Row]:
+    """Return the last row of each track, and of each node in a net, that earlier solvers have published."""
+    return [message for message in _held(bus, TRACK, TRACK_LAG, NET_POSE) if isinstance(message, Row)]
+
+
+def _held(bus: Bus, *topics: Topic) -> list[Message]:
     refusals = Refusals("solver, of what the hub holds")
-    held = [refusals.open(received) for topic in (POSE, REJECTED) for received in bus.newest(topic)]
-    return [answer_of(one.message) for one in held if one and isinstance(one.message, Outcome)]
+    held = [refusals.open(received) for topic in topics for received in bus.newest(topic)]
+    return [one.message for one in held if one]

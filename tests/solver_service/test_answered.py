@@ -1,13 +1,14 @@
 """A solver that is started again says what has not been said, and nothing twice."""
 
 from collections import Counter
+from itertools import pairwise
 
 import pytest
 from buddyline.protocol.bus import Received
 from buddyline.protocol.clock import S_NS, ManualClock
 from buddyline.protocol.codec import decode, encode
 from buddyline.protocol.local_bus import LocalNetwork, LocalPublisher
-from buddyline.protocol.messages import Candidates, Rejected
+from buddyline.protocol.messages import Candidates, NodePose, Rejected
 from buddyline.protocol.topics import CANDIDATES, key_of, parse_key
 from buddyline.solver_service import owed
 from buddyline.solver_service.answered import Answered, AnsweredPair, answer_of
@@ -19,6 +20,7 @@ from msgspec.structs import replace
 
 from tests.processes import until
 from tests.solver_service.conftest import PERIOD_NS, START_NS, dive_messages
+from tests.tools import evaluated
 
 
 def outcome(trigger, reason="ambiguous"):
@@ -78,6 +80,74 @@ def test_pairs_are_answered_each_for_itself():
     assert not answered.is_over([("a", "b"), ("a", "c")], now_ns - 60 * S_NS, now_ns)
 
 
+def row(k, mode="filter"):
+    """Return the track's row of the second of trigger k."""
+    return evaluated.track(0, mode=mode, stamp_ns=k * S_NS)
+
+
+def place(k):
+    return NodePose(
+        net="main",
+        node="a",
+        stamp_ns=k * S_NS,
+        p_m=(0.0, 0.0, 0.0),
+        q_xyzw=(0.0, 0.0, 0.0, 1.0),
+        v_mps=(0.0, 0.0, 0.0),
+        covariance=[0.0] * 36,
+        fixed=True,
+        mode="filter",
+        age_s=0.0,
+    )
+
+
+def second(trigger, **changes):
+    return replace(outcome(trigger, **changes), stamp_ns=trigger * S_NS)
+
+
+def answered_to(k, *held):
+    answered = Answered([answer_of(second(k))])
+    answered.know_rows(held)
+    return answered
+
+
+def test_rows_of_tracks_and_nets_that_were_told_are_not_told_again():
+    answered = answered_to(20, row(19), row(18, "lag"), place(20))
+    given = [one for k in range(10, 23) for one in (row(k), row(k, "lag"), place(k))]
+    due = answered.unsaid(given)
+    assert [one.stamp_ns // S_NS for one in due if one.mode == "lag"] == [19, 20, 21, 22]
+    assert [one.stamp_ns // S_NS for one in due if isinstance(one, NodePose)] == [21, 22]
+    assert [one for one in due if one == row(20)] == [row(20)]
+    assert row(19) not in due
+    # A clock may be set back later on.
+    assert answered.unsaid([row(3), place(3)]) == [row(3), place(3)]
+
+
+def test_without_the_hub_s_word_a_track_goes_on_some_seconds_before_the_last_answer():
+    assert answered_to(20).unsaid([row(14), row(15), row(16)]) == [row(16)]
+
+
+def test_a_row_that_no_solver_of_the_dive_has_told_silences_no_track():
+    assert answered_to(20, row(10**6), place(10**6)).unsaid([row(21), place(21)]) == [row(21), place(21)]
+
+
+def test_rows_that_were_withheld_are_told_where_it_is_another_dive():
+    answered = answered_to(20, row(19), place(19))
+    assert answered.unsaid([row(5), second(5), place(5), row(6)]) == []
+    assert answered.saw_new_frame([("a", "b")], 21, 21 * S_NS) == []
+    assert answered.saw_new_frame([("a", "b")], 7, 7 * S_NS) == [second(5), row(5), row(6), place(5)]
+    assert answered.unsaid([row(7)]) == [row(7)]
+
+
+def test_rows_of_an_earlier_dive_with_more_triggers_a_second_are_told():
+    answered, other = answered_to(20, row(19)), replace(outcome(30), stamp_ns=15 * S_NS)
+    assert answered.unsaid([row(14), replace(other, trigger=29, reason="late"), other, row(15)]) == [
+        replace(other, trigger=29, reason="late"),
+        row(14),
+        other,
+        row(15),
+    ]
+
+
 def test_of_a_live_dive_only_the_last_moments_are_solved_again():
     now_ns = 10**18
     said = Rejected(node_a="a", node_b="b", stamp_ns=now_ns - 20 * S_NS, trigger=7, reason="ambiguous")
@@ -127,6 +197,59 @@ def test_two_solvers_one_after_the_other_answer_every_trigger_once(live):
     counts = Counter(payload_trigger(one) for one in outcomes)
     assert set(counts) == {message.trigger for message in messages if isinstance(message, Candidates)}
     assert set(counts.values()) == {1}
+
+
+@pytest.mark.parametrize(
+    ("live", "held"), [(True, True), (False, True), (False, False)], ids=["live", "stored", "stored, new hub"]
+)
+def test_two_solvers_one_after_the_other_tell_every_row_of_the_tracks_once(live, held, tmp_path):
+    """As above; where the hub was killed, too, the journal tells how far the tracks were, to some seconds."""
+    messages, _ = dive_messages(seconds=15.0, period_ns=2 * PERIOD_NS)
+    gone_at, back_at = len(messages) * 7 // 10, len(messages) * 8 // 10
+    clock = ManualClock(START_NS if live else START_NS + 86_400 * S_NS)
+    config = SolverConfig(nodes=["a", "b"], journal=str(tmp_path / "answered"))
+    network, rows = LocalNetwork(clock), []
+    with network.connect() as nodes, network.connect() as viewer:
+        publishers = {key: nodes.publisher(parse_key(key)[0], *parse_key(key)[1]) for key in map(key_of, messages)}
+        viewer.subscribe(("buddyline/pair/*/*/track", "buddyline/pair/*/*/track_lag"), rows.append, capacity=10_000)
+
+        def publish(part, service=None):
+            for message in part:
+                clock.set_ns(max(clock.now_ns() + 1, message.stamp_ns))
+                publishers[key_of(message)].put(message)
+                if service is not None and isinstance(message, Candidates):
+                    stream = service.core.streams[message.node]
+                    until(lambda stream=stream, ns=message.stamp_ns: (stream.newest_ns or 0) >= ns)
+
+        with network.connect() as bus:
+            service = SolverService(config, clock=clock)
+            service.attach(bus)
+            publish(messages[:gone_at], service)
+        until(lambda: len(rows) > 100)
+        first = stamps_of(rows)
+        if not held:
+            network.newest.clear()
+        publish(messages[gone_at:back_at])
+        with network.connect() as bus:
+            service = SolverService(config, clock=clock)
+            service.attach(bus)
+            publish(messages[back_at:], service)
+            with service._lock:
+                service._publish(service.core.flush())
+        until(lambda: all(max(of) > messages[-1].stamp_ns - S_NS for of in stamps_of(rows).values()))
+    for name, stamps_ns in stamps_of(rows).items():
+        again = [stamp_ns for stamp_ns, count in Counter(stamps_ns).items() if count > 1]
+        assert not (held and again), name
+        assert all(stamp_ns > max(first[name]) - 6 * S_NS for stamp_ns in again)
+        told_ns = sorted(set(stamps_ns))
+        assert {after - before for before, after in pairwise(told_ns)} == {S_NS // 20}
+
+
+def stamps_of(rows):
+    found = {"track": [], "track_lag": []}
+    for row in rows:
+        found[row.key.rpartition("/")[2]].append(opened(row).stamp_ns)
+    return found
 
 
 def payload_trigger(received):
