@@ -36,7 +36,8 @@ class Estimate:
     prediction, in sigmas. by_shares (SIZE, 4): how the state would be moved by a share of 1 of the samples' fast parts;
     shares: what the lights tell of them (vibration.py). by_scale (SIZE,), scale: the same of a gap between both bars
     (scale.py). attitude_s, depth_s: when attitudes and depths were last used. compasses: each node's heading as its
-    last attitude had it, minus the track's, rad, and the variance that it stated, rad^2.
+    last attitude had it, minus the track's, rad, and the variance that it stated, rad^2. north_doubt: the variance,
+    rad^2, that north has beside the covariance, as the compasses contradict each other.
 
     The lights: detection (2, 2): by observer and light, how often a light in the picture is found; shown (2, 2): how
     likely it was to be found at shown_s, by observer, after the last picture had told. last_seen (2,):
@@ -77,6 +78,7 @@ class Estimate:
     attitude_s: list[float] = field(default_factory=lambda: [-np.inf, -np.inf])
     depth_s: float = -np.inf
     compasses: list[tuple[float, float]] = field(default_factory=lambda: [(0.0, np.inf), (0.0, np.inf)])
+    north_doubt: float = 0.0
     steps: Trail = field(default_factory=Trail)
     confirmed: bool = False
     shaking: Shaking = field(default_factory=Shaking)
@@ -123,16 +125,15 @@ class Estimate:
         """No light is older than the start."""
         self.light_s = max(self.light_s, self.start_s)
 
-    @property
-    def north_doubt(self) -> float:
-        """Give the variance, rad^2, that north has beside the covariance, as both compasses contradict each other."""
-        (off_a, variance_a), (off_b, variance_b) = self.compasses
-        if not math.isfinite(variance_a + variance_b):
-            return 0.0
-        # How the nodes are turned to each other, about the vertical.
-        P, a, b = self.covariance, PHI[0].stop - 1, PHI[1].stop - 1
-        variance = float(P[a, a] + P[b, b] - 2.0 * P[a, b])
-        return north_doubt((off_a, off_b), (variance_a, variance_b), variance)
+    def take_compass(self, node: int, off_rad: float, variance: float) -> None:
+        """Note by how much a node's compass is off the track's heading, and the variance that it states."""
+        self.compasses[node] = off_rad, variance
+        (off_a, stated_a), (off_b, stated_b) = self.compasses
+        if math.isfinite(stated_a + stated_b):
+            # How the nodes are turned to each other, about the vertical.
+            P, a, b = self.covariance, PHI[0].stop - 1, PHI[1].stop - 1
+            relative = float(P[a, a] + P[b, b] - 2.0 * P[a, b])
+            self.north_doubt = north_doubt((off_a, off_b), (stated_a, stated_b), relative)
 
     @property
     def lights(self) -> int:

@@ -320,7 +320,7 @@ class TrackFilter(TrackPool):
         estimate = Estimate(t_s, state, covariance, t_s, agreed_s=t_s, agreed=1)
         if attitudes[0] is not None:
             estimate.attitude_s[0] = t_s
-            estimate.compasses[0] = 0.0, float(attitudes[0][1].sigma_rad[2] ** 2)
+            estimate.take_compass(0, 0.0, float(attitudes[0][1].sigma_rad[2] ** 2))
         estimate.light_s = t_s
         self._open(estimate)
         return estimate

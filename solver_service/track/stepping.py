@@ -173,7 +173,7 @@ class TrackSteps(TrackSights):
             camera = self.level_camera(node, seen)
             turn = estimate.rates_radps[node] * (t_s - time_s)
             y, H = anchors.attitude_residual(estimate.state, node, camera @ rotation_exp(turn))
-            estimate.compasses[node] = float(y[2]), float(seen.sigma_rad[2] ** 2)
+            estimate.take_compass(node, float(y[2]), float(seen.sigma_rad[2] ** 2))
             factors = (1.0, 1.0) if first else (2.0 * anchors.TILT_TIME_S / since, 2.0 * anchors.HEADING_TIME_S / since)
             noise = anchors.attitude_covariance(seen.R_ned_body, seen.sigma_rad, *factors)
             S = noise + (H @ estimate.covariance @ H.T)
