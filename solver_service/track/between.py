@@ -68,6 +68,7 @@ def _rows_together(
         path.lights[near],
         np.maximum(times_s - path.light_s[near], 0.0),
         path.north_doubt[two],
+        path.nearest_lit_m[near],
     )
 
 

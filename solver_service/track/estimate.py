@@ -40,9 +40,9 @@ class Estimate:
     rad^2, that north has beside the covariance, as the compasses contradict each other.
 
     The lights: detection (2, 2): by observer and light, how often a light in the picture is found; shown (2, 2): how
-    likely it was to be found at shown_s, by observer, after the last picture had told. last_seen (2,):
-    the probability that each light is among the last picture's candidates, None where not both should be in it.
-    lit_s (2, 2): when each was last used. light_s: when any was, at first the start, which is made of lights; trigger:
+    likely it was to be found at shown_s, by observer, after the last picture had told. last_seen (2,): the probability
+    that each light is among the last picture's candidates, None where not both should be in it. lit_s (2, 2): when each
+    was last used. light_s: when any was, at first the start, which is made of lights; lit_m: the range then. trigger:
     time, observer and light of those of the last trigger. pictures: how many it has taken since it is confirmed; bare:
     of these, how many while a node had no inertial unit. bars: how many pictures showed both lights, bar_s: when one
     last did; late_bars: how many did from REFLECTED_S after the start on. told_by: how many of each node showed any.
@@ -74,6 +74,7 @@ class Estimate:
     shown_s: list[float] = field(default_factory=lambda: [-np.inf, -np.inf])
     lit_s: Floats = field(default_factory=lambda: np.full((2, 2), -np.inf))
     light_s: float = -np.inf
+    lit_m: float = math.nan
     trigger: list[tuple[float, int, int]] = field(default_factory=list)
     attitude_s: list[float] = field(default_factory=lambda: [-np.inf, -np.inf])
     depth_s: float = -np.inf
@@ -124,6 +125,8 @@ class Estimate:
     def __post_init__(self) -> None:
         """No light is older than the start."""
         self.light_s = max(self.light_s, self.start_s)
+        if math.isnan(self.lit_m):
+            self.lit_m = float(self.state.range_m)
 
     def take_compass(self, node: int, off_rad: float, variance: float) -> None:
         """Note by how much a node's compass is off the track's heading, and the variance that it states."""

@@ -299,7 +299,7 @@ class TrackFilter(TrackPool):
         H[:, COLUMNS] = J
         self._apply(estimate, H, y, noise)
         estimate.agreed = 0
-        estimate.light_s = t_s
+        estimate.light_s, estimate.lit_m = t_s, float(estimate.state.range_m)
         estimate.skip_s = t_s - estimate.start_s + ONE_TRIGGER_S
         self._amend_step(estimate)
 
@@ -438,4 +438,5 @@ class TrackFilter(TrackPool):
             self._step(main, main.t_s + TICK_S, None)
         row = self._present(main, t_s)
         self._last_row = main, row
-        return DueRow(stamp_ns, row, main.rates_radps, main.lights, t_s - main.light_s, main.north_doubt)
+        age_s = t_s - main.light_s
+        return DueRow(stamp_ns, row, main.rates_radps, main.lights, age_s, main.north_doubt, main.lit_m)

@@ -143,14 +143,21 @@ class DueRow:
     """A row that is to be told, and what it is made of: the track at its time, and how its lights were.
 
     rates_radps (2, 3): of the track's last step. age_s: since the last light, of so many of the last trigger.
-    north_doubt: as of the estimate.
+    north_doubt: as of the estimate. lit_m: the range at the last light.
     """
 
     def __init__(
-        self, stamp_ns: int, forecast: Forecast, rates_radps: Floats, lights: int, age_s: float, north_doubt: float
+        self,
+        stamp_ns: int,
+        forecast: Forecast,
+        rates_radps: Floats,
+        lights: int,
+        age_s: float,
+        north_doubt: float,
+        lit_m: float,
     ) -> None:
         self.stamp_ns, self.forecast, self.rates_radps = stamp_ns, forecast, rates_radps
-        self.lights, self.age_s, self.north_doubt = lights, age_s, north_doubt
+        self.lights, self.age_s, self.north_doubt, self.lit_m = lights, age_s, north_doubt, lit_m
         self._rows: list[TrackRow | None] = []
 
     @property
@@ -186,6 +193,7 @@ def make_rows(due: Iterable[DueRow]) -> None:
             np.array([one.lights for one in every]),
             np.array([one.age_s for one in every]),
             np.array([one.north_doubt for one in every]),
+            np.array([one.lit_m for one in every]),
         )
         for one, row in zip(some, rows, strict=True):
             one.take(row)

@@ -14,7 +14,8 @@ from buddyline.solver_service.track.lights import COLUMNS
 from buddyline.solver_service.track.state import NAV, PHI, R_, V_, State
 from numpy.typing import NDArray
 
-# A position no better than this share of the range is not told.
+# A position no better than this share of the range is not told: of the range that it tells, and of that at the light
+# nearest in time. Without lights an estimate drifts, and the farther it has drifted the more such a share of it is.
 WORST_SHARE: Final = 0.2
 # A fix contradicts beyond this chi^2 of 6 degrees of freedom, an attitude beyond it of 3: chances of 1e-5 and 3e-7.
 CONTRADICTS: Final = 33.0
@@ -127,11 +128,12 @@ def rows_of(
     lights: NDArray[np.int64],
     ages_s: Floats,
     north_doubts: Floats,
+    lit_m: Floats,
 ) -> list[TrackRow | None]:
     """Give the rows of a batch of states (N), None where a position is no better than WORST_SHARE of the range.
 
     P (N, C, C): the covariances of COLUMNS. north_doubts (N,): variances of what turns all about the vertical, which
-    only what is told in north-east-down has.
+    only what is told in north-east-down has. lit_m (N,): the ranges at the lights nearest in time.
     """
     now = at_one_time(states, rates_radps)
     toward = np.swapaxes(now.R[:, 0], -1, -2)
@@ -140,7 +142,7 @@ def rows_of(
     whole[:, :3, :3] += _bent(whole[:, :6, :6])
     ranges_m = np.sqrt(inner(now.r_m, now.r_m))
     told = np.isfinite(whole).all(axis=(1, 2))
-    told &= np.sqrt(np.trace(whole[:, :3, :3], axis1=1, axis2=2)) <= WORST_SHARE * ranges_m
+    told &= np.sqrt(np.trace(whole[:, :3, :3], axis1=1, axis2=2)) <= WORST_SHARE * np.minimum(ranges_m, lit_m)
     turned_m = now.r_m @ _ABOUT_DOWN
     whole[:, 9:, 9:] += north_doubts[:, None, None] * (turned_m[:, :, None] * turned_m[:, None, :])
     sigma_ned_m = np.sqrt(np.maximum(whole[:, range(9, 12), range(9, 12)], 0.0))

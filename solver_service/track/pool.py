@@ -107,6 +107,7 @@ class TrackPool(TrackSteps):
             shaking=again.shaking,
             surprise=again.surprise,
             told=again.told,
+            lit_m=again.lit_m,
             steps=again.steps if keep_s else Trail(),
             attitude_s=again.attitude_s,
             depth_s=again.depth_s,

@@ -134,6 +134,8 @@ class PathPass(TrackSteps):
             start_s,
             confirmed=True,
             light_s=start_s,
+            # The start need not have been made of lights.
+            lit_m=math.inf,
             detection=detection.copy(),
             shaking=shaking,
             walking=known.walking,

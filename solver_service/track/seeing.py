@@ -266,7 +266,7 @@ class TrackSights(TrackMoves):
         note_lit(estimate, sight, used)
         estimate.surprise += chi2
         estimate.told += len(rows_y)
-        estimate.light_s = max(estimate.light_s, sight.t_s)
+        estimate.light_s, estimate.lit_m = max(estimate.light_s, sight.t_s), float(estimate.state.range_m)
         estimate.trigger += [(sight.t_s, sight.node, light) for _, light, _ in found.chosen]
         return used
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -46,13 +47,13 @@ SWINGS: Final = 20
 class Path:
     """Smoothed steps as columns, in order of time.
 
-    t_s, light_s (N,), lights (N,), north_doubt (N,), rates_radps (N, 2, 3): of the steps. states: State.row of each.
-    halves: of the covariance of COLUMNS, its upper half. drawn (N, 6): variances that noise added in the step before,
-    of A's and B's attitude and of the velocity: by shaking, and by all else. without (N, 2): which node had no inertial
-    unit in that step. oldest (SIZE, SIZE): the whole covariance at the first step. auxiliary (N, 3, 3), where
+    t_s, light_s (N,), lights (N,), north_doubt (N,), rates_radps (N, 2, 3), lit_m (N,): of the steps. states: State.row
+    of each. halves: of the covariance of COLUMNS, its upper half. drawn (N, 6): variances that noise added in the step
+    before, of A's and B's attitude and of the velocity: by shaking, and by all else. without (N, 2): which node had no
+    inertial unit in that step. oldest (SIZE, SIZE): the whole covariance at the first step. auxiliary (N, 3, 3), where
     it was asked for: of the step before, for the velocity and for A's and B's turn rates, the auxiliary residual's
-    square (the sum of its axes), what that is expected to be, and the variance that noise added (one axis). across
-    (N, C, C), where it was asked for: the covariance of COLUMNS of the step before (rows) with each step (columns).
+    square (the sum of its axes), what that is expected to be, and the variance that noise added (one axis). across (N,
+    C, C), where it was asked for: the covariance of COLUMNS of the step before (rows) with each step (columns).
     """
 
     t_s: Floats
@@ -67,6 +68,7 @@ class Path:
     looks: Sequence[tuple[Look, ...]]
     oldest: Floats
     auxiliary: Floats
+    lit_m: Floats
     across: Floats | None = None
 
     def __len__(self) -> int:
@@ -75,7 +77,7 @@ class Path:
 
     def after(self, earlier: Path) -> Path:
         """Give this path with an earlier one before it, whose last step is its first."""
-        of_steps = "t_s", "light_s", "lights", "north_doubt", "rates_radps"
+        of_steps = "t_s", "light_s", "lights", "north_doubt", "rates_radps", "lit_m"
         columns = (*of_steps, "states", "halves", "drawn", "without", "auxiliary")
         both = {name: np.concatenate((getattr(earlier, name)[:-1], getattr(self, name))) for name in columns}
         return Path(**both, looks=[*earlier.looks[:-1], *self.looks], oldest=earlier.oldest)
@@ -100,6 +102,20 @@ class Path:
         changes[2:] = 0.5 * ((self.rates_radps[2:] - self.rates_radps[1:-1]) ** 2).mean(axis=2)
         near = np.stack([np.convolve(changes[:, node], np.ones(SWINGS) / SWINGS, "full") for node in (0, 1)], axis=1)
         return near[SWINGS // 2 : SWINGS // 2 + len(self)]
+
+    @cached_property
+    def nearest_lit_m(self) -> Floats:
+        """The range at the light that is nearest in time to each step, (N,); inf where there is none."""
+        lit = np.flatnonzero([any(look.chosen for look in seen) for seen in self.looks])
+        times_s, ranges_m = np.append(self.t_s[lit], math.inf), np.append(State(self.states[lit]).range_m, math.inf)
+        steps = np.arange(len(self))
+        after, so_far = np.searchsorted(lit, steps), np.searchsorted(lit, steps, side="right")
+        # The last light may be older than the path.
+        older_s = np.where(np.isfinite(self.lit_m), self.t_s - self.light_s, math.inf)
+        since_s = np.where(so_far, self.t_s - times_s[so_far - 1], older_s)
+        before_m = np.where(so_far, ranges_m[so_far - 1], self.lit_m)
+        nearest_m: Floats = np.where(since_s <= times_s[after] - self.t_s, before_m, ranges_m[after])
+        return nearest_m
 
     def covariance(self, k: NDArray[np.intp] | int) -> Floats:
         """Give the covariance (..., C, C) of COLUMNS at steps."""
@@ -142,6 +158,7 @@ def smoothed(
         looks=looks,
         oldest=np.empty((SIZE, SIZE)),
         auxiliary=np.zeros((count, 3, 3)),
+        lit_m=np.empty(count),
         across=np.zeros((count, len(COLUMNS), len(COLUMNS))) if across else None,
     )
     drawn, later = np.empty((count, *_DRAWN[0].shape)), None
@@ -167,7 +184,7 @@ def smoothed(
             P = step.covariance + gain @ (P - P_before) @ gain.T
             P = 0.5 * (P + P.T)
         path.t_s[k], path.light_s[k], path.lights[k] = step.t_s, step.light_s, step.lights
-        path.north_doubt[k] = step.north_doubt
+        path.north_doubt[k], path.lit_m[k] = step.north_doubt, step.lit_m
         found[k], path.halves[k] = here, P[_BLOCK_UPPER]
         drawn[k] = step.Q[_DRAWN]
         path.rates_radps[k] = step.rates_radps

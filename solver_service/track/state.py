@@ -6,7 +6,15 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.rotation import Floats, applied, left_jacobian, rotation_exp, rotation_log, skew
+from buddyline.solver_service.geometry.rotation import (
+    Floats,
+    applied,
+    inner,
+    left_jacobian,
+    rotation_exp,
+    rotation_log,
+    skew,
+)
 
 # Where each error stands in the error state: R_ is the position r's, not a rotation R's, which is PHI. A's part comes
 # first where a quantity belongs to a node.
@@ -101,6 +109,12 @@ class State:
     def mount_rad(self) -> Floats:
         """The small turns that bring the units' axes, as stated, to the true ones (2, 3), camera axes."""
         return self._of_nodes(_MOUNT)
+
+    @property
+    def range_m(self) -> Floats:
+        """How far B is from A (...)."""
+        ranges_m: Floats = np.sqrt(inner(self.r_m, self.r_m))
+        return ranges_m
 
     @property
     def lever_m(self) -> Floats:

@@ -93,6 +93,7 @@ class TrackSteps(TrackSights):
                     lights=estimate.lights,
                     north_doubt=estimate.north_doubt,
                     looks=looks,
+                    lit_m=estimate.lit_m,
                 )
             )
             if math.isinf(self._keep_s):
@@ -112,6 +113,7 @@ class TrackSteps(TrackSights):
                 light_s=estimate.light_s,
                 lights=estimate.lights,
                 looks=last.looks + looks,
+                lit_m=estimate.lit_m,
             )
 
     def increments(self, estimate: Estimate, t_s: float) -> Increments:
@@ -201,5 +203,7 @@ class TrackSteps(TrackSights):
         if self._keep_s:
             still = np.eye(SIZE)[:MOVING], np.zeros((MOVING, MOVING)), np.zeros(SIZE - MOVING)
             row, rates = estimate.state.row, estimate.rates_radps
-            first = Step(estimate.t_s, row, row, estimate.covariance, *still, rates, estimate.light_s, 0)
+            first = Step(
+                estimate.t_s, row, row, estimate.covariance, *still, rates, estimate.light_s, 0, lit_m=estimate.lit_m
+            )
             estimate.steps.append(first)

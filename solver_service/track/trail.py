@@ -55,6 +55,7 @@ class Step:
     before: predicted; after, covariance: with what was seen at t_s. Both are a state's row (ROW,), or the error (SIZE,)
     against the path that a pass is linear about. F (MOVING, SIZE), Q (MOVING, MOVING), walk: how it came here from the
     step before. rates_radps (2, 3). lights: how many the last trigger's pictures told. north_doubt: as of the estimate.
+    lit_m: the range at the last light, at light_s, inf where none has been.
     """
 
     t_s: float
@@ -69,13 +70,14 @@ class Step:
     lights: int
     north_doubt: float = 0.0
     looks: tuple[Look, ...] = ()
+    lit_m: float = math.inf
 
 
 # So many steps are packed at once.
 PACK = 128
 _UPPER, _MOVING_UPPER = np.triu_indices(SIZE), np.triu_indices(MOVING)
 _HALVES = (len(_UPPER[0]),), (len(_MOVING_UPPER[0]),)
-_SHAPES = ((), (), (), (), (2, 3), *_HALVES, (MOVING, SIZE), (SIZE - MOVING,))
+_SHAPES = ((), (), (), (), (), (2, 3), *_HALVES, (MOVING, SIZE), (SIZE - MOVING,))
 _ENDS = np.cumsum([math.prod(shape) for shape in _SHAPES]).tolist()
 _PARTS = list(zip([0, *_ENDS], _ENDS, _SHAPES, strict=False))
 
@@ -106,7 +108,7 @@ def _packed(steps: list[Step]) -> _Pack:
 
 
 def _row_of(step: Step) -> Floats:
-    numbers = np.array((step.t_s, step.light_s, step.lights, step.north_doubt))
+    numbers = np.array((step.t_s, step.light_s, step.lights, step.north_doubt, step.lit_m))
     halves = step.covariance[_UPPER], step.Q[_MOVING_UPPER]
     matrices = step.rates_radps.ravel(), *halves, step.F.ravel()
     return np.concatenate((numbers, *matrices, step.walk, step.before, step.after))
@@ -114,14 +116,14 @@ def _row_of(step: Step) -> Floats:
 
 def _step_of(row: Floats, looks: tuple[Look, ...]) -> Step:
     parts = (row[start:end].reshape(shape) for start, end, shape in _PARTS)
-    t_s, light_s, lights, doubt, rates, half, of_Q, F, walk = parts
+    t_s, light_s, lights, doubt, lit_m, rates, half, of_Q, F, walk = parts
     covariance = np.empty((SIZE, SIZE))
     covariance[_UPPER] = covariance.T[_UPPER] = half
     Q = np.empty((MOVING, MOVING))
     Q[_MOVING_UPPER] = Q.T[_MOVING_UPPER] = of_Q
     before, after = row[_ENDS[-1] :].reshape(2, -1)
     told = float(light_s), int(lights), float(doubt)
-    return Step(float(t_s), before, after, covariance, F, Q, walk, rates, *told, looks)
+    return Step(float(t_s), before, after, covariance, F, Q, walk, rates, *told, looks, float(lit_m))
 
 
 class Trail:

@@ -151,9 +151,11 @@ def make(seed: int, setting: Setting, motion: SwayingPair | None = None, lamps: 
     return KnownDive((records[0], records[1]), fixes, stamps, (toward @ apart[:, :, None])[:, :, 0], toward @ R_b)
 
 
-def filter_of(records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen]) -> TrackFilter:
-    """Make a filter that keeps its steps and holds a whole dive."""
-    track = TrackFilter(records[0].node, records[1].node, keep_s=math.inf)
+def filter_of(
+    records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen], *, keep_s: float = math.inf
+) -> TrackFilter:
+    """Make a filter that keeps its steps for keep_s and holds a whole dive."""
+    track = TrackFilter(records[0].node, records[1].node, keep_s=keep_s)
     for node, record in enumerate(records):
         feed(track, node, record)
     for fix in fixes:

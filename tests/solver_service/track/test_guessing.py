@@ -87,6 +87,7 @@ def path_of(
         looks=[(looks or {}).get(k, LIT) for k in range(count)],
         oldest=nothing,
         auxiliary=auxiliary,
+        lit_m=nothing,
     )
 
 
