@@ -190,7 +190,7 @@ def _of_first_pass(
         return _of_one_lamp_each(known, max(parts, key=lasted_s), outputs_ns, gap)
     # Beside a track of any other start these are not linear enough for the passes below.
     parts = [part for part in parts if not part.lone]
-    learned = replace(known, walking=joint([part.walking for part in parts]), unrest=_unrest(parts))
+    learned = replace(known, walking=joint([part.walking for part in parts]).cautious(), unrest=_unrest(parts))
     found: list[tuple[PathPass, Path]] = []
     lost: list[str] = []
     since_s, contradicting_ns = -math.inf, None

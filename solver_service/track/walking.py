@@ -35,6 +35,9 @@ MOST: Final = 2.0 * np.log(10.0 * FIRST)
 WALKS: Final = len(FIRST)
 OF_UNITS: Final = slice(0, 2)
 OF_NODES: Final = slice(2, WALKS)
+# Seconds of light tell a bias's walk to a factor of three, and too small a walk makes seconds without light look known.
+# So what is taken for a whole dive is so many sigmas above what was learned, but no more than the first value.
+CAUTIOUS_SIGMAS: Final = 2.0
 _BIASES: Final = (GYRO_BIAS, ACCEL_BIAS)
 
 
@@ -56,6 +59,14 @@ class Walking:
     def densities(self) -> Floats:
         """Densities per root s, as FIRST has them."""
         return np.asarray(np.exp(0.5 * self.logs))
+
+    def cautious(self) -> Walking:
+        """Give the walks of units that may be, as little as has been learned of them: CAUTIOUS_SIGMAS."""
+        logs, sigmas = self.logs.copy(), np.sqrt(np.diag(np.linalg.inv(self.information)))
+        first = 2.0 * np.log(FIRST[OF_UNITS])
+        raised = np.minimum(logs[OF_UNITS] + CAUTIOUS_SIGMAS * sigmas[OF_UNITS], first)
+        logs[OF_UNITS] = np.maximum(logs[OF_UNITS], raised)
+        return replace(self, logs=logs)
 
     def following(self, walking: tuple[bool, bool]) -> Walking:
         """Follow the walks that there are if these nodes have a unit; where others were followed, begin at 0."""

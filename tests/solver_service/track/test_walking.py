@@ -96,6 +96,19 @@ def test_the_walk_is_found_whatever_was_believed(times: float) -> None:
     assert np.abs(together.logs - found.logs).max() < 0.1
 
 
+@pytest.mark.parametrize(("told", "taken"), [(1e4, 0.2), (4.0, 0.2 * np.e**0.5), (1.0, 0.2 * np.e), (0.25, 1.0)])
+def test_a_small_walk_that_little_light_has_told_is_taken_to_be_larger(told: float, taken: float) -> None:
+    """By two sigmas of its logarithm, but it is no larger than at first."""
+    logs, information = Walking().logs, Walking().information
+    logs[:2] += 2.0 * np.log(0.2)
+    information[:2, :2] = told * np.eye(2)
+    cautious = Walking(logs, information).cautious()
+    assert cautious.densities[:2] / FIRST[:2] == pytest.approx(taken, rel=0.02)
+    assert (cautious.logs[2:] == logs[2:]).all()
+    larger = replace(Walking(), logs=Walking().logs + 1.0, information=information)
+    assert (larger.cautious().logs == larger.logs).all()
+
+
 def test_a_node_without_a_unit_tells_nothing_of_its_biases() -> None:
     walk = walk_of(Walking())
     alone = Walking().stepped(transition(), walk, (False, False))
