@@ -302,8 +302,8 @@ class PathPass(TrackSteps):
         detection = found_now(main, observer, sight.t_s)
         # What is likely, but not sure, is taken where the next picture comes soon and tells whether it was right.
         slow = self.guessed is not None and sight.t_s - main.shown_s[observer] > SOON_S
-        within, least = np.array(inside, dtype=float), SURE if slow else LIKELY
-        found = by_path.odds.associate(sight.sigma_px, detection, within, least)
+        least = SURE if slow else LIKELY
+        found = by_path.odds.associate(sight.sigma_px, detection, by_path.within, least)
         main.evidence += found.evidence
         learn_found(main, observer, sight.t_s, detection, inside, found)
         if all(inside):

@@ -82,14 +82,15 @@ class PassGuide:
 class BySight:
     """What a path says of one picture.
 
-    X (L, 3): the lights, camera frame. y (K, L, 2), H (K, L, 2, C): residuals and Jacobians. odds: its candidates', by
-    the path without what the picture has told it.
+    X (L, 3): the lights, camera frame. y (K, L, 2), H (K, L, 2, C): residuals and Jacobians. odds: its candidates',
+    within (L,): how likely each light is within it, both by the path without what the picture has told it.
     """
 
     X: Floats
     y: Floats
     H: Floats
     odds: Odds
+    within: Floats
 
 
 class TrackSights(TrackMoves):
@@ -225,9 +226,10 @@ class TrackSights(TrackMoves):
         y_without = y + (H[..., :-1] @ (gain @ y_used[..., None])[:, None, None])[..., 0]
         # Candidates that a picture does not have are nowhere.
         y_without[~bearings.any(axis=2)] = np.inf
-        area_px2 = self.nodes[observer].rig.camera.area_px2
-        odds = odds_of(y_without, H, with_stamp(P), sigma_px, np.array([sight.clutter / area_px2 for _, sight in seen]))
-        return list(map(BySight, X[:, 0], y, H, odds))
+        camera, P = self.nodes[observer].rig.camera, with_stamp(P)
+        odds = odds_of(y_without, H, P, sigma_px, np.array([sight.clutter / camera.area_px2 for _, sight in seen]))
+        within = [share_within(camera, *one, EDGE_PX) for one in zip(X[:, 0], D[:, 0], P, strict=True)]
+        return list(map(BySight, X[:, 0], y, H, odds, within))
 
     def _about(
         self, estimate: Estimate, sight: Sight, chosen: Chosen, guide: PassGuide | None

@@ -127,6 +127,37 @@ def test_pictures_are_weighed_together_by_all_the_dive_but_themselves() -> None:
     assert len(counts) > 5
 
 
+def test_a_false_candidate_is_no_light_where_a_path_hardly_knows_where_the_lights_are() -> None:
+    """In a second without light: a lamp that is known to hundreds of pixels need not be in the picture at all."""
+    dive = make(6, Setting(seconds=6.0, near_m=2.0, far_m=3.0, false=1, dark_s=(3.0, 4.0)))
+    first = filter_of(dive.records, dive.fixes)
+    pass_over(first, dive.records, dive.fixes)
+    path = smoothed(parts_of(first)[0].steps)
+    dark = [k for k, seen in enumerate(path.looks) if seen and not any(look.chosen for look in seen)]
+    halves = path.halves.copy()
+    halves[dark] *= 1e5
+    wide = replace(path, halves=halves)
+    epoch_ns = EPOCH_NS - EPOCH_NS % 86_400_000_000_000
+    often = np.full((2, 2), 0.97)
+    known = PassedOver(dive.records, epoch_ns, 0, np.zeros((2, 2)), Walking())
+    track = PathPass(known, wide, often.copy(), Shaking())
+    for node, record in enumerate(dive.records):
+        feed(track, node, record)
+    sights = {(sight.node, sight.stamp_ns): sight for _, _, _, sight in track._events if isinstance(sight, Sight)}
+    within, candidates = [], 0
+    for key, guide in track.guides.items():
+        if guide.step in dark:
+            sight = sights[key]
+            [by_path] = track._by_path(wide, [(guide, sight)])
+            # What a picture without lights teaches is forgotten.
+            track.passed.detection, track.passed.shown_s = often.copy(), [-np.inf, -np.inf]
+            assert track._associated(sight, by_path).chosen == ()
+            within.append(by_path.within)
+            candidates += len(sight.bearings)
+    assert candidates > 10
+    assert 0.2 < np.mean(within) < 0.8
+
+
 def test_what_a_slow_dive_says_of_a_picture_without_it_is_exact() -> None:
     """A third of a second without a unit: the picture tells far more than all others, and must be taken out whole."""
     dive = make(9, Setting(seconds=12.0, rate_hz=3.0, near_m=4.0, far_m=8.0, false=0))
