@@ -113,24 +113,27 @@ def in_picture(camera: Camera, pixel_px: Floats | None, margin_px: float = 0.0) 
 
 
 def share_within(camera: Camera, X: Floats, D: Floats, P: Floats, margin_px: float) -> Floats:
-    """Give how likely each light (L,) lies within the picture, margin_px from its edges.
+    """Give how likely each light (..., L) lies within the picture, margin_px from its edges.
 
-    X (L, 3), D (L, 3, C): the lights and how errors of covariance P (C, C) move them, as `light_positions` gives them.
-    The errors of u and v are taken to be independent.
+    X (..., L, 3), D (..., L, 3, C): the lights and how errors of covariance P (..., C, C) move them, as
+    `light_positions` gives them. The errors of u and v are taken to be independent.
     """
-    share, size_px = np.zeros(len(X)), np.array((camera.width_px, camera.height_px))
-    pixels = {light: pixel for light, each in enumerate(X) if (pixel := pixel_of(camera, each)) is not None}
+    share, size_px = np.zeros(X.shape[:-1]), np.array((camera.width_px, camera.height_px))
+    of_all = X.reshape(-1, 3)
+    pixels = {light: pixel for light, each in enumerate(of_all) if (pixel := pixel_of(camera, each)) is not None}
     if not pixels:
         return share
     lights, at = list(pixels), np.array(list(pixels.values()))
     _, tangents = camera.rays(at)
-    J = tangents @ D[lights] / np.sqrt((X[lights] ** 2).sum(axis=1))[:, None, None]
-    reach_px = np.sqrt(2.0 * np.maximum((J @ P * J).sum(axis=2), SMALL_PX))
+    J = tangents @ D.reshape(-1, *D.shape[-2:])[lights] / np.sqrt((of_all[lights] ** 2).sum(axis=1))[:, None, None]
+    P_of_each = P.reshape(-1, *P.shape[-2:])[np.array(lights) // X.shape[-2]]
+    reach_px = np.sqrt(2.0 * np.maximum((J @ P_of_each * J).sum(axis=2), SMALL_PX))
     near, far = (margin_px - 0.5 - at) / reach_px, (size_px - 0.5 - margin_px - at) / reach_px
+    shares = share.reshape(-1)
     for light, below, above in zip(lights, near.tolist(), far.tolist(), strict=True):
         inside = math.prod(0.5 * (math.erf(b) - math.erf(a)) for a, b in zip(below, above, strict=True))
         # The model of a distorted lens ends outside of the picture.
-        share[light] = inside if inside > 0.0 else 0.0
+        shares[light] = inside if inside > 0.0 else 0.0
     return share
 
 

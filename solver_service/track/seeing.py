@@ -228,7 +228,7 @@ class TrackSights(TrackMoves):
         y_without[~bearings.any(axis=2)] = np.inf
         camera, P = self.nodes[observer].rig.camera, with_stamp(P)
         odds = odds_of(y_without, H, P, sigma_px, np.array([sight.clutter / camera.area_px2 for _, sight in seen]))
-        within = [share_within(camera, *one, EDGE_PX) for one in zip(X[:, 0], D[:, 0], P, strict=True)]
+        within = share_within(camera, X[:, 0], D[:, 0], P, EDGE_PX)
         return list(map(BySight, X[:, 0], y, H, odds, within))
 
     def _about(
