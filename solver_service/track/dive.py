@@ -17,7 +17,7 @@ from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.guessing import GuessedMotion
 from buddyline.solver_service.track.inputs import FixSeen
-from buddyline.solver_service.track.output import TrackRow
+from buddyline.solver_service.track.output import CONTRADICTS, TrackRow, fix_chi2
 from buddyline.solver_service.track.parts import (
     MOST_LEFT_S,
     NEAR_CLOCK_S,
@@ -62,6 +62,8 @@ CLOCK_ROUNDS: Final = 4
 NEVER_FOUND: Final = 0.1
 # A track that began without a fix, and is carried back by more than this, is passed over until that settles.
 LATE_S: Final = 2.0
+# Then one in so many of its steps is compared with those of the same track that was not carried back.
+COMPARED: Final = 5
 # A track whose start is so near to the dive's is left as it is.
 LEAST_EARLIER_S: Final = 0.15
 # Offsets that are tried where a first pass gives more than one track, and none goes on (`goes_on`); a pass finds one up
@@ -202,11 +204,12 @@ def _of_first_pass(
         # Where the dive's beginning, before the first start, leads the passes astray, it is left out.
         tries = [path] if earlier is None else [path.after(earlier), path]
         late = len(parts) == 1 and part.searched and not part.agreed and path.t_s[0] - tries[0].t_s[0] > LATE_S
+        believed = part.detection, shaking, known if late else learned, sum(part.told_by)
+        alone = settled(path, *believed, doubtful=True) if late else None
         for about in tries:
-            told_by, by_first = sum(part.told_by), known if late else learned
-            one = settled(about, part.detection, shaking, by_first, told_by, doubtful=late)
+            one = alone if late and about is path else settled(about, *believed, doubtful=late)
             limit_s = MOST_LEFT_S if about is path else NEAR_CLOCK_S
-            if one is None:
+            if one is None or (alone is not None and _contradict(one[1], alone[1])):
                 continue
             passed_s, first_s = _clock_s(*one), clock_ns * 1e-9 + part.state.clock_s
             # What a late start tells of the clocks is little, and less than it believes.
@@ -225,6 +228,16 @@ def _of_first_pass(
         return Smoothed([], clock_ns * 1e-9, math.inf, [*first.problems, *lost])
     whole = _rows_of(found, outputs_ns, gap)
     return replace(whole, problems=[*whole.problems, *lost])
+
+
+def _contradict(path: Path, alone: Path) -> bool:
+    """Whether a path that was carried back is elsewhere, at a step of the one that was not, than that one bears."""
+    for k in range(0, len(alone), COMPARED):
+        there = path.state(int(np.abs(path.t_s - alone.t_s[k]).argmin()))
+        pose = FixSeen(0, there.R[0].T @ there.r_m, there.R[0].T @ there.R[1], np.zeros((6, 6)))
+        if fix_chi2(alone.state(k), alone.covariance(k), alone.rates_radps[k], pose) > CONTRADICTS:
+            return True
+    return False
 
 
 def why_none(off_s: float) -> str:
