@@ -22,7 +22,6 @@ from buddyline.solver_service.track.parts import (
     MOST_LEFT_S,
     NEAR_CLOCK_S,
     TOLD_SIGMAS,
-    apart,
     clock_left_ns,
     clock_off_by,
     goes_on,
@@ -172,7 +171,7 @@ def _of_first_pass(
     first, parts, clock_ns = passed.track, passed.parts, passed.clock_ns
     if not parts:
         return Smoothed([], clock_ns * 1e-9, math.inf, first.problems)
-    parts = apart(of_one_clock(parts))
+    parts = of_one_clock(parts)
     without = any(map(mostly_without, parts))
     off_s = (clock_ns - told_ns) * 1e-9
     far = in_pieces(parts) or clock_off_by(parts[-1], MOST_LEFT_S)
@@ -350,7 +349,7 @@ def _of_guessed_motion(
     Each is passed over again. Where that does not settle, the first pass's path stands.
     """
     found: list[tuple[TrackFilter | PathPass, Path]] = []
-    for part in apart(parts_of(first)):
+    for part in parts_of(first):
         path, guessed = smoothed(part.steps, auxiliary=True, uses_up=True), GuessedMotion.of(part.walking)
         known = PassedOver(
             records,

@@ -342,7 +342,8 @@ class TrackFilter(TrackPool):
             sigma_m = math.sqrt(float(np.trace(place_covariance(main.state, main.covariance))))
             if sigma_m > LOST_SHARE * min(range_m, LOST_RANGE_M):
                 # It knows no more than a new start would.
-                main.end_s = main.t_s
+                main.end_s = main.light_s + 1.0
+                main.steps.drop_after(main.end_s)
                 self.finished.append(main)
                 self.main = main = None
         if main is not None and main.confirmed:

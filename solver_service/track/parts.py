@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import combinations, pairwise
+from itertools import combinations
 from typing import Final
 
 from buddyline.solver_service.track.estimate import Estimate
@@ -33,19 +33,6 @@ def parts_of(track: TrackFilter) -> list[Estimate]:
     parts = [part for part in track.finished if part.steps]
     if track.main is not None and track.main.confirmed and track.main.steps:
         parts.append(track.main)
-    return parts
-
-
-def apart(parts: list[Estimate]) -> list[Estimate]:
-    """Let each track that was lost in darkness end half-way to the next one's start, if it does not end before.
-
-    The next one is carried back to there. Each half is then told by the track whose lights are nearer.
-    """
-    for part, later in pairwise(parts):
-        middle_s = max(0.5 * (part.light_s + later.start_s), part.light_s)
-        if middle_s < part.end_s:
-            part.end_s = middle_s
-            part.steps.drop_after(middle_s)
     return parts
 
 

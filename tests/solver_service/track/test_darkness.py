@@ -52,10 +52,3 @@ def test_what_has_drifted_away_in_darkness_is_told_no_longer(mode: str, *, dark_
     assert dark.sum() > 20
     assert (~dark).sum() > 100
     assert sigmas_m[dark].max() < 1.1 * WORST_SHARE * lit_m
-
-
-def test_a_smoothed_track_that_is_lost_at_its_end_is_told_for_as_long_as_the_live_one() -> None:
-    dive = make(4, Setting(seconds=18.0, poor=True, near_m=1.2, far_m=2.0, dark_s=(8.0, 18.0)))
-    ends_s = [(told(dive, mode)[-1].stamp_ns - EPOCH_NS) / 1e9 for mode in ("smooth", "filter")]
-    assert ends_s[1] > 11.0
-    assert ends_s[0] > ends_s[1] - 1.0

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from buddyline.solver_service.track.dive import why_none
 from buddyline.solver_service.track.estimate import Estimate
-from buddyline.solver_service.track.parts import apart, goes_on, in_pieces, of_one_clock, parts_of
+from buddyline.solver_service.track.parts import goes_on, in_pieces, of_one_clock, parts_of
 from buddyline.solver_service.track.state import CLOCK
-from buddyline.solver_service.track.trail import Trail
 
 from tests.solver_service.track.dives import Setting, filter_of, make
 
@@ -95,18 +93,3 @@ def test_why_there_is_no_track_is_laid_on_the_clocks_only_where_they_are_far_apa
     assert "their clocks seem some 0.30 s apart" in why_none(0.3)
     assert "clocks" not in why_none(0.001)
     assert "mounted otherwise than stated" in why_none(0.001)
-
-
-@pytest.mark.parametrize(("lost_s", "starts_s", "ends_s"), [(9.0, 12.0, 8.0), (6.0, 12.0, 6.0), (9.0, 3.5, 4.0)])
-def test_two_tracks_share_the_darkness_between_them(
-    part: Estimate, lost_s: float, starts_s: float, ends_s: float
-) -> None:
-    """The first one's last light is at 4 s; where the second has begun before, it ends there."""
-    first = replace(part, start_s=0.0, light_s=4.0, end_s=lost_s, steps=Trail())
-    for t_s in np.arange(0.0, lost_s + 0.05, 0.1):
-        first.steps.append(replace(part.steps.last, t_s=t_s))
-    second = replace(part, start_s=starts_s, light_s=20.0)
-    assert apart([first, second]) == [first, second]
-    assert first.end_s == ends_s
-    assert first.steps.last.t_s == pytest.approx(ends_s, abs=0.11)
-    assert second.end_s == part.end_s
