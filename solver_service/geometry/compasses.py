@@ -75,7 +75,7 @@ def compare_headings(
 
 
 def north_doubt(off_rad: Sequence[float], variances: Sequence[float], variance: float) -> float:
-    """Give the variance, rad^2, that north has beside what two compasses state; 0 unless they are further apart.
+    """Give what the variance of north gains where two compasses are further apart than they state, rad^2; else 0.
 
     off_rad (2,): each compass minus the north that is told. variances (2,): as they state, rad^2. variance: of their
     difference, by what tells how the nodes are turned to each other. One compass is right, and which of the two is as

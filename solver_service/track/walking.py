@@ -61,7 +61,7 @@ class Walking:
         return np.asarray(np.exp(0.5 * self.logs))
 
     def cautious(self) -> Walking:
-        """Give the walks of units that may be, as little as has been learned of them: CAUTIOUS_SIGMAS."""
+        """Give walks of units CAUTIOUS_SIGMAS above what was learned, but not above their first values."""
         logs, sigmas = self.logs.copy(), np.sqrt(np.diag(np.linalg.inv(self.information)))
         first = 2.0 * np.log(FIRST[OF_UNITS])
         raised = np.minimum(logs[OF_UNITS] + CAUTIOUS_SIGMAS * sigmas[OF_UNITS], first)
