@@ -27,7 +27,6 @@ from buddyline.solver_service.track.lights import Sight
 from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S
 from buddyline.solver_service.track.problems import Problems
 from buddyline.solver_service.track.samples import Samples
-from buddyline.solver_service.track.turning import Turning
 
 # FIXES_TO_JOIN poses of one pair in a row, no further apart in time than JOIN_WITHIN_S, and each in reach of the one
 # before, place a node: a single one may be wrong.
@@ -94,11 +93,11 @@ class NetFilter(TrackIntake):
         """
         self.nodes.append(node)
         self.samples.append(Samples())
-        self.turning.append(Turning())
         self.attitudes.append([])
         self.depths.append([])
         self._rejected.append(0)
         index = len(self.nodes) - 1
+        self.turning.append(self._turning_of(index))
         if place is not None:
             self._watches[index] = FixedWatch(node.name, place.R)
             self.main.places[index] = place

@@ -199,8 +199,8 @@ def _single(
     for found in chain.from_iterable(options):
         found.sort(reverse=True)
         del found[MAX_OPTIONS:]
-    half, across = 0.5 * np.trace(S[:, 0], axis1=-2, axis2=-1), S[:, 0, ..., 0, 1]
-    return options, half + np.hypot(half - S[:, 0, ..., 1, 1], across)
+    first, across, second = S[:, 0, ..., 0, 0], S[:, 0, ..., 0, 1], S[:, 0, ..., 1, 1]
+    return options, 0.5 * (first + second) + np.hypot(0.5 * (first - second), across)
 
 
 def _both(

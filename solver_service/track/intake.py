@@ -6,7 +6,6 @@ import bisect
 import heapq
 from collections.abc import Sequence
 from dataclasses import replace
-from operator import itemgetter
 from typing import Final, TypeVar
 
 import numpy as np
@@ -24,7 +23,7 @@ from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSe
 from buddyline.solver_service.track.lights import Sight, sights_of
 from buddyline.solver_service.track.problems import Problems
 from buddyline.solver_service.track.samples import Samples
-from buddyline.solver_service.track.turning import Turning
+from buddyline.solver_service.track.turning import Turning, time_of
 from buddyline.solver_service.track.units import clipped, fault_of, stuck
 
 CHECK_EVERY_S: Final = 2.0
@@ -39,7 +38,6 @@ UNTOLD_SIGMA_RAD: Final = np.radians((1.5, 1.5, 6.0))
 # No fix's numbers, in m, rad and their squares, are as large.
 BEYOND: Final = 1e4
 Seen = TypeVar("Seen", AttitudeSeen, DepthSeen)
-_time_of: Final = itemgetter(0)
 
 
 class TrackIntake:
@@ -59,7 +57,7 @@ class TrackIntake:
         self.attitudes: list[list[tuple[float, AttitudeSeen]]] = [[] for _ in nodes]
         self.depths: list[list[tuple[float, DepthSeen]]] = [[] for _ in nodes]
         self._events: list[tuple[float, int, int, Sight | FixSeen | int]] = []
-        self.turning = [Turning() for _ in nodes]
+        self.turning = list(map(self._turning_of, range(len(nodes))))
         self._count = 0
         self._checked_s = -np.inf
         self._compared_s = -np.inf
@@ -117,17 +115,15 @@ class TrackIntake:
 
     def add_attitude(self, node: int, seen: AttitudeSeen) -> None:
         """Take an attitude message; sigmas that no attitude filter reaches are taken for unknown."""
-        if not seen.sigma_rad.min() > LEAST_SIGMA_RAD:
+        if not all(sigma > LEAST_SIGMA_RAD for sigma in seen.sigma_rad.tolist()):
             seen = replace(seen, sigma_rad=np.maximum(seen.sigma_rad, UNTOLD_SIGMA_RAD))
             said = f"node {self.nodes[node].name}: attitude sigmas of zero are taken as unknown"
             self._problems.report(said, self.seconds(node, seen.stamp_ns))
-        t_s = self.seconds(node, seen.stamp_ns)
-        bisect.insort(self.attitudes[node], (t_s, seen), key=_time_of)
-        self.turning[node].add(t_s, self.level_camera(node, seen), seen.sigma_rad)
+        bisect.insort(self.attitudes[node], (self.seconds(node, seen.stamp_ns), seen), key=time_of)
 
     def add_depth(self, node: int, seen: DepthSeen) -> None:
         """Take a depth message."""
-        bisect.insort(self.depths[node], (self.seconds(node, seen.stamp_ns), seen), key=_time_of)
+        bisect.insort(self.depths[node], (self.seconds(node, seen.stamp_ns), seen), key=time_of)
 
     def add_frames(self, node: int, frames: Sequence[FrameSeen]) -> None:
         """Take the candidates of pictures."""
@@ -147,6 +143,9 @@ class TrackIntake:
         # The count keeps two of a kind at one time in their order: they cannot be compared.
         self._count += 1
         heapq.heappush(self._events, (t_s, kind, self._count, what))
+
+    def _turning_of(self, node: int) -> Turning:
+        return Turning(self.attitudes[node], self.nodes[node].rig.R_body_camera)
 
     def level_camera(self, node: int, seen: AttitudeSeen) -> Floats:
         """Give R_level_camera of an attitude message."""
@@ -216,7 +215,7 @@ class TrackIntake:
 
     def _turning_told(self, node: int, start_s: float, end_s: float) -> TurningTold:
         items, samples = self.attitudes[node], self.samples[node]
-        seen = items[bisect.bisect_left(items, start_s, key=_time_of) : bisect.bisect_left(items, end_s, key=_time_of)]
+        seen = items[bisect.bisect_left(items, start_s, key=time_of) : bisect.bisect_left(items, end_s, key=time_of)]
         first, stop = np.searchsorted(samples.times_s, (start_s, end_s))
         return TurningTold(
             np.array([at_s for at_s, _ in seen]),
@@ -266,13 +265,11 @@ class TrackIntake:
         """Drop what no step will look at again."""
         for node in range(len(self.nodes)):
             self.samples[node].forget_before(t_s)
-            self.turning[node].forget_before(t_s)
             for items in (self.attitudes[node], self.depths[node]):
-                while len(items) > 1 and items[0][0] < t_s:
-                    items.pop(0)
+                del items[: min(bisect.bisect_left(items, t_s, key=time_of), len(items) - 1)]
 
 
 def newest_before(items: list[tuple[float, Seen]], t_s: float) -> tuple[float, Seen] | None:
     """Give the last of (time, message) at or before t_s, None where there is none."""
-    at = bisect.bisect_right(items, t_s, key=_time_of)
+    at = bisect.bisect_right(items, t_s, key=time_of)
     return items[at - 1] if at else None

@@ -115,9 +115,9 @@ class Shaking:
         z = z * math.sqrt(min(1.0, MOST_CHI2 * len(y) / max(chi2, 1e-9)))
         D = H @ shaken @ H.T
         W, y_moved = S_inverse @ D, H @ moved
-        traces = W.reshape(3, -1)[:, :: len(y) + 1].sum(axis=1)
-        slope = 0.5 * (D @ z @ z - traces) + z @ y_moved
-        fisher = 0.5 * (W.reshape(3, -1) @ np.swapaxes(W, 1, 2).reshape(3, -1).T) + y_moved.T @ S_inverse @ y_moved
+        by_row = W.reshape(3, -1)
+        slope = 0.5 * (D @ z @ z - by_row[:, :: len(y) + 1].sum(axis=1)) + z @ y_moved
+        fisher = 0.5 * (by_row @ W.transpose(0, 2, 1).reshape(3, -1).T) + y_moved.T @ S_inverse @ y_moved
         logs, information = learned(self.logs, self.information, slope, fisher, FIRST_LOGS, KEPT, CALM)
         return Shaking(np.minimum(np.maximum(logs, LEAST), MOST), information)
 

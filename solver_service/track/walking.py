@@ -126,12 +126,13 @@ class Walking:
         # Half of what (I - K H) D (I - K H)^T takes off, the other half is its transpose. Rounding must not make the
         # rest asymmetric: that part would grow.
         spread = self.spread + (gain @ D - 2.0 * across) @ gain.T
-        spread = 0.5 * (spread + np.swapaxes(spread, 1, 2))
+        spread = 0.5 * (spread + spread.transpose(0, 2, 1))
         if not learns:
-            return replace(self, spread=spread, moved=moved)
+            return Walking(self.logs, self.information, self.followed, spread, moved)
         y_moved = H @ self.moved
-        slope = 0.5 * (D @ z @ z - np.trace(W, axis1=1, axis2=2)) + y_moved.T @ z
-        fisher = 0.5 * (W.reshape(len(W), -1) @ np.swapaxes(W, 1, 2).reshape(len(W), -1).T)
+        by_row = W.reshape(len(W), -1)
+        slope = 0.5 * (D @ z @ z - by_row[:, :: len(y) + 1].sum(axis=1)) + y_moved.T @ z
+        fisher = 0.5 * (by_row @ W.transpose(0, 2, 1).reshape(by_row.shape).T)
         at = self.followed, self.followed
         information = self.information.copy()
         information[at] += fisher + y_moved.T @ S_inverse @ y_moved
@@ -139,7 +140,7 @@ class Walking:
         step[self.followed] = np.linalg.solve(information[at], slope)
         step = np.minimum(np.maximum(step, -LONGEST_STEP), LONGEST_STEP)
         logs = np.minimum(np.maximum(self.logs + step, LEAST), MOST)
-        return replace(self, logs=logs, information=information, spread=spread, moved=moved)
+        return Walking(logs, information, self.followed, spread, moved)
 
 
 def joint(all_told: Sequence[Walking]) -> Walking:
