@@ -18,6 +18,7 @@ from buddyline.protocol.bus import CACHE_S
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.codec import encode
 from buddyline.protocol.messages import Message
+from buddyline.protocol.messages.fields import Count
 from buddyline.protocol.statusfile import runtime_directory
 from buddyline.protocol.topics import POSE, REJECTED, key_of, parse_key
 from buddyline.solver_service.answered import THIS_DIVE_NS, Answer, Outcome, answer_of
@@ -64,6 +65,7 @@ class Journal:
         self.path = path.with_name(f"{path.name}.{instance}") if instance else path
         self._last: dict[tuple[str, str], bytes] = {}
         self._decoder = msgspec.json.Decoder(Answer)
+        self._numbers = msgspec.json.Decoder(Count)
         self._file: int | None = None
         self._bytes = 0
         self._failed = False
@@ -88,9 +90,11 @@ class Journal:
                 continue
             if key == FRAME:
                 words = payload.split()
-                if len(words) == FRAME_WORDS and words[-1] == END and all(word.isdigit() for word in words[1:3]):
-                    frame = words[0].decode("ascii", "replace"), int(words[1]), int(words[2])
-                    past.frames += [frame] * (abs(now_ns - frame[2]) < THIS_DIVE_NS)
+                if len(words) == FRAME_WORDS and words[-1] == END:
+                    with contextlib.suppress(msgspec.DecodeError):
+                        trigger, stamp_ns = map(self._numbers.decode, words[1:3])
+                        if abs(now_ns - stamp_ns) < THIS_DIVE_NS:
+                            past.frames.append((words[0].decode("ascii", "replace"), trigger, stamp_ns))
                 continue
             try:
                 one = self._decoder.decode(payload)

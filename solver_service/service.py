@@ -15,6 +15,7 @@ from buddyline.protocol.clock import S_NS, Clock, SystemClock
 from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import Candidates, Message
+from buddyline.protocol.messages.fields import Count, StampNs
 from buddyline.protocol.security import PLAYER
 from buddyline.protocol.service import Service
 from buddyline.protocol.statusfile import StatusFile
@@ -62,8 +63,8 @@ TOGETHER: Final = 256
 
 
 class _FrameHead(msgspec.Struct):
-    trigger: int
-    stamp_ns: int
+    trigger: Count
+    stamp_ns: StampNs
 
 
 _FRAME_HEAD: Final = msgspec.json.Decoder(_FrameHead)

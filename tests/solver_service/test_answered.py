@@ -385,6 +385,26 @@ def test_what_waited_when_a_solver_was_killed_has_an_outcome(tmp_path, monkeypat
     assert waited <= late < set(counts)
 
 
+def test_a_refused_frame_ends_no_later_solver(tmp_path, monkeypatch):
+    """Its outcome could not be told: a solver that noted it ended, and each after it."""
+    monkeypatch.setattr(owed, "OWED_S", 0.0)
+    messages, _ = dive_messages(seconds=1.0)
+    frame = next(one for one in messages if isinstance(one, Candidates))
+    clock = ManualClock(frame.stamp_ns + S_NS)
+    network = LocalNetwork(clock)
+    config = SolverConfig(nodes=["a", "b"], journal=str(tmp_path / "answered"))
+    first, second = SolverService(config, clock=clock), SolverService(config, clock=clock)
+    first._journal.add([Rejected(node_a="a", node_b="b", stamp_ns=1, trigger=1, reason="ambiguous")])
+    payload = encode(frame).replace(f'"trigger":{frame.trigger}'.encode(), f'"trigger":{2**63}'.encode())
+    with network.connect() as bus:
+        first.attach(bus)
+        first._note_arrival(key_of(frame), payload)
+        first.receive(Received(key_of(frame), payload, clock.now_ns(), ""))
+        assert first.refusals.count == 1
+        second.attach(bus)
+        second.tick(status_due=True)
+
+
 def test_what_has_come_again_is_not_given_up_while_it_waits(tmp_path, monkeypatch):
     """A solver on a busy machine takes longer than OWED_S to come to the frames that it has received."""
     monkeypatch.setattr(owed, "OWED_S", 0.0)

@@ -92,6 +92,14 @@ def test_a_line_that_was_cut_off_is_left_out(tmp_path):
     assert kept(path) == {("a", "b"): 3}
 
 
+def test_a_frame_that_no_message_can_name_is_left_out(tmp_path):
+    """As a solver had noted it that did not look at a refused message's numbers."""
+    one = Journal(tmp_path / "solver.answered")
+    one.add_frame("a", 3, frame(3).stamp_ns)
+    one.add_frame("a", 2**63, frame(4).stamp_ns)
+    assert [trigger for _, trigger, _ in Journal(one.path).read(NOW_NS).frames] == [3]
+
+
 def test_it_stays_small(tmp_path, monkeypatch):
     monkeypatch.setattr(journal, "MOST_BYTES", 2000)
     path = tmp_path / "solver.answered"
