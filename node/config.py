@@ -21,6 +21,8 @@ from buddyline.protocol.messages import (
     Role,
     Vector3,
 )
+from buddyline.protocol.messages.fields import check_unit
+from buddyline.protocol.messages.node import check_apart
 from buddyline.protocol.security import Tls
 from msgspec import UNSET, Meta, UnsetType, field
 from msgspec.structs import replace
@@ -108,6 +110,10 @@ class SensorsConfig(Config, frozen=True, kw_only=True):
     magnetometer_offset_t: Vector3 = (0.0, 0.0, 0.0)
     magnetometer_matrix: tuple[Vector3, Vector3, Vector3] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
+    def __post_init__(self) -> None:
+        """Check the mount's quaternion."""
+        check_unit("mount_xyzw", self.mount_xyzw)
+
     @property
     def magnetometer_calibration(self) -> MagnetometerCalibration:
         """The calibration of the magnetometer; one that changes nothing where none is configured."""
@@ -130,6 +136,11 @@ class CalibrationConfig(Config, frozen=True, kw_only=True):
     imu_delay_ns: Annotated[int, Meta(ge=-MAX_IMU_DELAY_NS, le=MAX_IMU_DELAY_NS)] | None = None
     declination_rad: float = 0.0
     tags: list[ArTag] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Check what NodeInfo would refuse."""
+        check_unit("q_body_camera_xyzw", self.q_body_camera_xyzw)
+        check_apart(self.light_left_m, self.light_right_m)
 
 
 class RecordConfig(Config, frozen=True, kw_only=True):
@@ -211,9 +222,13 @@ class FixedConfig(Config, frozen=True, kw_only=True):
     sigma_m: Annotated[float, Meta(ge=0)] = 0.003
     sigma_rad: Annotated[float, Meta(ge=0)] = 0.002
 
+    def __post_init__(self) -> None:
+        """Check the quaternion's norm."""
+        check_unit("q_xyzw", self.q_xyzw)
+
     @property
     def place(self) -> FixedPlace:
-        """The place as NodeInfo carries it; raises ValueError for a quaternion that is none."""
+        """The place as NodeInfo carries it."""
         return FixedPlace(
             net=self.net, p_m=self.p_m, q_xyzw=self.q_xyzw, sigma_m=self.sigma_m, sigma_rad=self.sigma_rad
         )
@@ -386,22 +401,12 @@ class NodeConfig(Config, frozen=True, kw_only=True):
         if self.record.encoder == "camera" and self.camera.name != "picamera2":
             raise ConfigError(f"record.encoder = 'camera': camera {self.camera.name!r} has none, only 'picamera2' has")
 
-    def check_fixed(self) -> None:
-        """Raise ConfigError for a place that is none."""
-        if self.fixed is None:
-            return
-        try:
-            _ = self.fixed.place
-        except ValueError as error:
-            raise ConfigError(f"fixed.{error}") from error
-
 
 def load_node_config(path: Path | str) -> NodeConfig:
     """Read a node's TOML file; raise ConfigError naming file, field and value."""
     config = load_config(path, NodeConfig)
     try:
         config.check_pins()
-        config.check_fixed()
         config.check_encoder()
         config.power.check()
     except ConfigError as error:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import difflib
 import hashlib
+import math
 import re
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -42,8 +44,11 @@ def parse_config(text: str, schema: type[C], name: str) -> C:
     """Read TOML text as schema; name: the file's name in errors. Raises ConfigError."""
     try:
         table = _table_of(text)
+        infinite = [f"{field} = {value}" for field, value in _numbers_of(table) if not math.isfinite(value)]
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ConfigError(f"{name}: not TOML: {error}") from error
+    if infinite:
+        raise ConfigError(f"{name}: {infinite[0]}: not a finite number")
     try:
         return msgspec.convert(table, schema)
     except msgspec.ValidationError as error:
@@ -59,6 +64,18 @@ def _table_of(text: str) -> dict[str, Any]:
         except (ModuleNotFoundError, ValueError):
             pass  # tomllib says where an error is.
     return tomllib.loads(text)
+
+
+def _numbers_of(value: Any, field: str = "") -> Iterator[tuple[str, float]]:
+    """Yield all numbers with a point in a table, each with its field's name."""
+    if isinstance(value, float):
+        yield field, value
+    elif isinstance(value, dict):
+        for key, each in value.items():
+            yield from _numbers_of(each, f"{field}.{key}" if field else key)
+    elif isinstance(value, list):
+        for at, each in enumerate(value):
+            yield from _numbers_of(each, f"{field}[{at}]")
 
 
 def config_sha256(config: msgspec.Struct) -> str:
@@ -80,7 +97,10 @@ def _explain(error: str, table: dict[str, Any], schema: type[msgspec.Struct]) ->
         value = value_at(table, field)
     except LookupError:
         return error
-    return f"{field} = {value!r}: {without_field(error, field)}" if field else error
+    if not field:
+        return error
+    where = f"[{field}] " if isinstance(value, dict) else f"{field} = {value!r}: "
+    return where + without_field(error, field)
 
 
 def _keys_at(schema: type[msgspec.Struct], field: str) -> list[str]:

@@ -310,7 +310,7 @@ def open_sensors(config: NodeConfig, clock: Clock) -> list[ImuSource | DepthSour
     sensors = config.sensors
     check_names(sensors.imu, sensors.depth)
     x, y, z, w = sensors.mount_xyzw
-    R_body_chip = quaternion_to_matrix(np.array([w, x, y, z]))
+    R_body_chip = quaternion_to_matrix(np.array([w, x, y, z]) / np.linalg.norm((w, x, y, z)))
     bus = I2cBus(sensors.i2c_bus)
     imu: ImuSource | None = None
     depth: DepthSource | None = None

@@ -25,6 +25,12 @@ MAX_MEANS: Final = 32
 Role: TypeAlias = Literal["full", "lights", "camera"]
 
 
+def check_apart(light_left_m: Vector3, light_right_m: Vector3) -> None:
+    """Raise ValueError for two lights at one place."""
+    if math.dist(light_left_m, light_right_m) < 1e-3:
+        raise ValueError("light_left_m, light_right_m: less than 1 mm apart")
+
+
 class CameraModel(Struct, frozen=True, kw_only=True):
     """Camera intrinsics. pinhole: OpenCV's k1 k2 p1 p2 k3; fisheye: k1..k4. Pixel centres at integers."""
 
@@ -137,8 +143,7 @@ class NodeInfo(Message, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         """Check the mount's quaternion and that the two lights are apart."""
         check_unit("q_body_camera_xyzw", self.q_body_camera_xyzw)
-        if math.dist(self.light_left_m, self.light_right_m) < 1e-3:
-            raise ValueError("light_left_m, light_right_m: less than 1 mm apart")
+        check_apart(self.light_left_m, self.light_right_m)
 
 
 class Imu(Message, frozen=True, kw_only=True):

@@ -51,6 +51,25 @@ def test_an_absurd_place_or_delay_is_refused_with_its_name(tmp_path, line):
         load_node_config(path)
 
 
+@pytest.mark.parametrize(
+    ("table", "line", "named"),
+    [
+        ("calibration", "light_left_m = [0.44, 0.0, 0.0]", r"\[calibration\] light_left_m, light_right_m: less than"),
+        ("calibration", "light_left_m = [nan, 0.10, 0.00]", r"a\.toml: calibration\.light_left_m\[0\] = nan: not"),
+        ("calibration", "q_body_camera_xyzw = [0.0, 0.0, 0.0, 0.0]", r"\[calibration\] q_body_camera_xyzw: norm 0"),
+        ("sensors", "mount_xyzw = [1.0, 1.0, 0.0, 0.0]", r"\[sensors\] mount_xyzw: norm 1\.41421"),
+    ],
+)
+def test_a_rig_that_cannot_be_is_refused_with_its_name(tmp_path, table, line, named):
+    path = tmp_path / "a.toml"
+    lines = (REPOSITORY / "node/examples/pi.toml").read_text().splitlines()
+    lines = [each for each in lines if each.split(" ")[0] != line.split(" ")[0]]
+    lines.insert(lines.index(f"[{table}]") + 1, line)
+    path.write_text("\n".join(lines))
+    with pytest.raises(ConfigError, match=named):
+        load_node_config(path)
+
+
 def test_role_and_fixed_place_go_into_node_info():
     plain = config(CAMERA, 1640, 1232)
     info = plain.node_info(1, "", "", 0)
@@ -64,7 +83,7 @@ def test_role_and_fixed_place_go_into_node_info():
 @pytest.mark.parametrize(
     ("table", "named"),
     [
-        ("p_m = [0.0, 0.0, 1.0]\nq_xyzw = [0.5, 0.5, 0.5, 0.9]", r"a\.toml: fixed\.q_xyzw: norm"),
+        ("p_m = [0.0, 0.0, 1.0]\nq_xyzw = [0.5, 0.5, 0.5, 0.9]", r"a\.toml: \[fixed\] q_xyzw: norm"),
         ("p_m = [0.0, 1.0]\nq_xyzw = [0.5, 0.5, 0.5, 0.5]", "fixed.p_m"),
         ("q_xyzw = [0.5, 0.5, 0.5, 0.5]", "p_m"),
         ("p_m = [0.0, 0.0, 1.0]\nq_xyzw = [0.5, 0.5, 0.5, 0.5]\nnet = 'Main'", "fixed.net"),
