@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -56,7 +56,9 @@ def new_file(path: Path | str, hint: str = REMOVE_IT) -> Iterator[Path]:
     except OSError as error:
         raise BuddylineError(f"{path}: cannot be written: {error.strerror}") from error
     finally:
-        part.unlink(missing_ok=True)
+        # A file system that has become read-only refuses this, too: what is told is why the file was not written.
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
 def write_new(path: Path | str, content: str | bytes, hint: str = REMOVE_IT) -> None:

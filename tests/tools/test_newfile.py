@@ -83,6 +83,15 @@ def test_a_full_disk_leaves_no_log_of_half_a_dive(tmp_path):
         assert list(disk.iterdir()) == []
 
 
+def test_a_disk_that_cannot_be_written_is_named(tmp_path):
+    """As a memory card is that its system has mounted read-only after errors."""
+    with (
+        small_disk(tmp_path / "disk", 64, "ro") as disk,
+        pytest.raises(BuddylineError, match=r"a\.txt: cannot be written: Read-only"),
+    ):
+        write_new(disk / "a.txt", "text")
+
+
 def test_a_log_gets_its_name_only_when_it_is_complete(tmp_path):
     with new_dive_log(tmp_path / "a.mcap", {"command": "test"}) as writer:
         writer.write_message(DEPTH)
