@@ -27,6 +27,13 @@ def range_sigma_m(estimate: Estimate) -> float:
     return math.sqrt(largest) * math.sqrt(max(along, 0.0))
 
 
+def range_gap_m(estimate: Estimate) -> float:
+    """Return the range by A's picture minus that by B's; NaN where both do not tell one by themselves."""
+    if isinstance(estimate, Track) or estimate.method == "three_lights":
+        return math.nan
+    return estimate.range_gap_m
+
+
 def _scaled(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     """Return values as shares of the largest, and that: squares of a stranger's numbers may be too large."""
     largest = float(np.abs(values).max())

@@ -179,7 +179,9 @@ def recompute(path: str) -> dict[str, Any]:
             "range_most_m": max(row["range_m"] for row in poses),
             "range_median_m": statistics.median(row["range_m"] for row in poses),
             "sigma_median_m": statistics.median(spread(row["covariance"]) for row in poses),
-            "range_gap_median_m": statistics.median(abs(row["range_gap_m"]) for row in poses),
+            "range_gap_median_m": statistics.median(
+                abs(row["range_gap_m"]) for row in poses if row["method"] != "three_lights"
+            ),
             "light_sigma_median_px": statistics.median(lights_px) if lights_px else None,
             "methods": dict(Counter(row["method"] for row in poses)),
             "checks": dict(Counter(check for row in poses for check in row["checks"])),

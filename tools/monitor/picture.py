@@ -31,7 +31,7 @@ from buddyline.protocol.messages import (
     Track,
 )
 from buddyline.protocol.topics import INFO, MARK, POSE, TRACK, Topic
-from buddyline.tools.estimate import Estimate, sigma_m
+from buddyline.tools.estimate import Estimate, range_gap_m, sigma_m
 from buddyline.tools.health.words import duration_words
 from buddyline.tools.monitor.scene import Floats, SceneFrame, frame_of
 from buddyline.tools.pairs import Pair
@@ -98,7 +98,7 @@ QUANTITIES: Final = (
     ("Azimuth, deg from north, clockwise", lambda point: _degrees(point.estimate.azimuth_rad)),
     ("Inclination, deg, up positive", lambda point: _degrees(point.estimate.inclination_rad)),
     (UNCERTAINTY, lambda point: sigma_m(point.estimate) * 1e3),
-    ("Gap between both nodes' ranges, mm", lambda point: _gap_m(point.estimate) * 1e3),
+    ("Gap between both nodes' ranges, mm", lambda point: range_gap_m(point.estimate) * 1e3),
     ("Latency from exposure to here, ms", lambda point: point.latency_s * 1e3),
 )
 
@@ -121,10 +121,6 @@ def columns(points: Iterable[Point], zero_ns: int) -> dict[str, Column]:
             column = np.unwrap(column, period=360.0) if title.startswith("Azimuth") else column
             found[title] = Column(t_s[known], column, tracked[known])
     return found
-
-
-def _gap_m(estimate: Estimate) -> float:
-    return estimate.range_gap_m if isinstance(estimate, RelativePose) else math.nan
 
 
 def _degrees(angle_rad: float | UnsetType) -> float:

@@ -152,7 +152,7 @@ def _figures(numbers: dict[str, Any]) -> str:
         rows.append(("position's uncertainty (1 sd) of a pose, median", sigma))
     if track:
         rows.append(("position's uncertainty (1 sd) of the track, median", length_words(track["sigma_median_m"])))
-    if poses:
+    if poses and poses["range_gap_median_m"] is not None:
         rows.append(("range gap between both nodes, median", length_words(poses["range_gap_median_m"])))
     for node, depth in numbers["depths"].items():
         rows.append((f"depth of {node}", f"{depth['least_m']:.2f} to {depth['most_m']:.2f} m"))

@@ -13,7 +13,7 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import Config
 from buddyline.protocol.messages import Track
 from buddyline.tools.dives import Dive
-from buddyline.tools.estimate import sigma_m
+from buddyline.tools.estimate import range_gap_m, sigma_m
 from buddyline.tools.evaluation.statistics import Stats
 from buddyline.tools.evaluation.triggers import trigger_figures
 from buddyline.tools.monitor.outliers import MAX_LISTED, Outlier
@@ -85,12 +85,13 @@ def _of_poses(summary: Summary) -> dict[str, Any] | None:
     if not poses:
         return None
     ranges_m = [pose.range_m for pose in poses]
+    gaps_m = [abs(gap_m) for pose in poses if not math.isnan(gap_m := range_gap_m(pose))]
     return {
         "range_least_m": min(ranges_m),
         "range_most_m": max(ranges_m),
         "range_median_m": _median(ranges_m),
         "sigma_median_m": _median([sigma_m(pose) for pose in poses]),
-        "range_gap_median_m": _median([abs(pose.range_gap_m) for pose in poses]),
+        "range_gap_median_m": _median(gaps_m) if gaps_m else None,
         "light_sigma_median_px": _median(list(sigmas_px)) if sigmas_px else None,
         "methods": dict(Counter(pose.method for pose in poses)),
         "checks": dict(Counter(check for pose in poses for check in pose.checks)),
