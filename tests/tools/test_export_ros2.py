@@ -14,6 +14,7 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Message, NodePose
 from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from buddyline.tools.cli import main
+from buddyline.tools.export.enu import BaseCamera
 from msgspec.structs import replace
 
 from tests.tools.evaluated import INFOS, pose, rejection, track, write_log
@@ -49,6 +50,21 @@ def spoken() -> list[Message]:
         covariance=mixed(6), fixed=False, mode="smooth", age_s=0.0,
     )  # fmt: skip
     return [*said, of_net, image("a", at(3)), status("a", at(4), "camera: gone"), solver_status(at(5))]
+
+
+def test_a_camera_stands_above_its_gauges_port() -> None:
+    """By as much as its attitude says: level and looking north, and then on its left side."""
+    camera = BaseCamera()
+    camera.base = "a"
+    camera.take(replace(INFOS["a"], depth_port_m=(0.1, 0.25, 0.0)))
+    camera.take(depth("a", at(0), 3.0))
+    assert camera.position_m("a").tolist() == [0.0, 0.0, -3.0]
+    camera.orientation(attitude("a", at(0)))
+    assert camera.position_m("a") == pytest.approx((0.0, 0.0, -2.75))
+    camera.take(depth("a", at(9), 3.0))
+    camera.orientation(attitude("a", at(9), (-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))))
+    assert camera.position_m("a") == pytest.approx((0.0, 0.0, -3.1))
+    assert camera.position_m("a", at(1)) == pytest.approx((0.0, 0.0, -2.75))
 
 
 @pytest.fixture(scope="module")

@@ -94,12 +94,20 @@ class BaseCamera:
             self._depths.setdefault(message.node, deque(maxlen=KEPT)).append(message)
 
     def position_m(self, node: str, at_ns: int | None = None) -> NDArray[np.float64]:
-        """Return a node's position: below the origin, or at it as long as its depth is not known. at_ns: None: last."""
-        depths = self._depths.get(node)
+        """Return where a node's camera is: below the origin, or at it as long as its depth is not known.
+
+        The gauge tells how deep its port is; how far that is below the camera is known with an attitude. at_ns: None:
+        last.
+        """
+        depths, attitudes, info = self._depths.get(node), self._attitudes.get(node), self.infos.get(node)
         if not depths:
             return np.zeros(3)
         depth = depths[-1] if at_ns is None else _nearest(reversed(depths), at_ns)
-        return np.array([0.0, 0.0, -depth.depth_m])
+        above_m = 0.0
+        if attitudes and info is not None:
+            R_enu_camera = _camera(_nearest(reversed(attitudes), depth.stamp_ns), info)
+            above_m = -float((R_enu_camera @ np.array(info.depth_port_m))[2])
+        return np.array([0.0, 0.0, above_m - depth.depth_m])
 
     def orientation(self, attitude: Attitude) -> NDArray[np.float64] | None:
         """Return R_enu_camera of the base.
