@@ -127,14 +127,15 @@ class Health:
                 )
         twins = [_twins_text(node) for node in nodes if self._twins(node, now_ns)]
         sizes = [_size_text(node, wrong) for node in nodes if (wrong := self._size.get(node, ""))]
-        return found + others + twins + sizes + self._one_code(nodes)
+        return found + others + twins + sizes + self._two_rates(nodes) + self._one_code(nodes)
 
     def of_dive(self, nodes: tuple[str, str]) -> list[str]:
-        """Return what a dive that is over told of a pair of nodes: one id, one code, another release, wrong sizes."""
+        """Return what a dive that is over told of a pair: one id, one code, two rates, another release, wrong sizes."""
         twins = [node for node in nodes if (runs := self._runs.get(node)) is not None and runs.twins]
         own, releases = self._other_releases(nodes)
         others = [f"node {node} ran Buddyline {its}, this is {own}" for node, its in releases]
-        return [*map(_twins_text, twins), *self._one_code(nodes), *others, *self.sizes_of_dive(nodes)]
+        rates = self._two_rates(nodes)
+        return [*map(_twins_text, twins), *rates, *self._one_code(nodes), *others, *self.sizes_of_dive(nodes)]
 
     def sizes_of_dive(self, nodes: Iterable[str]) -> list[str]:
         """Return which nodes had pictures of another size than their calibration."""
@@ -149,6 +150,15 @@ class Health:
     def _twins(self, node: str, now_ns: int) -> bool:
         runs = self._runs.get(node)
         return runs is not None and runs.returns >= TWINS and now_ns - runs.now_ns < TWINS_NS
+
+    def _two_rates(self, nodes: tuple[str, str]) -> list[str]:
+        """Say that two nodes' triggers count other instants, so that none is of both."""
+        periods_s = [self._period_s[node] for node in nodes if node in self._period_s]
+        if len(set(periods_s)) < len(nodes):
+            return []
+        a, b = nodes
+        rates = [f"{1.0 / period_s:.9g}" for period_s in periods_s]
+        return [f"nodes {a} and {b} take {rates[0]} and {rates[1]} pictures a second: give both one `rate_hz`"]
 
     def _one_code(self, nodes: tuple[str, str]) -> list[str]:
         """Name the nodes whose lamps blink as those of one of these do."""
