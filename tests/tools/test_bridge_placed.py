@@ -113,6 +113,14 @@ class TestPlacing:
         assert placed is not None
         assert placed.depth_m == 12.5
 
+    @pytest.mark.parametrize(("vehicle", "R"), [("b", R_NED_B), ("a", R_NED_A)])
+    def test_the_depth_is_the_cameras_not_its_gauges_ports(self, vehicle: str, R: Floats) -> None:
+        port_m = (0.1, 0.25, -0.12)
+        infos = [replace(info, depth_port_m=port_m) for info in INFOS.values()]
+        placed = take(Placing(vehicle), *infos, oriented(), depth(vehicle, at(5), 12.5), estimate())
+        assert placed is not None
+        assert placed.depth_m == pytest.approx(12.5 - (R @ R_BODY_CAMERA @ port_m)[2])
+
     def test_poses_count_only_where_no_track_is_fresh_and_the_late_track_never(self) -> None:
         placing = Placing("b")
         assert take(placing, *INFOS.values(), *(attitude("a", at(k)) for k in range(40)), pose(1)) is not None

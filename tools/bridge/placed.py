@@ -34,7 +34,7 @@ class Placed:
     """The vehicle's camera at stamp_ns: p_ned_m (3,) from the reference, turned by R_ned_body.
 
     covariance (6, 6): of p_ned_m (m) and of the small rotation w (rad) with R_true = exp(w) R_ned_body, both in
-    north-east-down, the compass's error counted. v_ned_mps, v_covariance: None where they are not known. depth_m: of
+    north-east-down, the compass's error counted. v_ned_mps, v_covariance: None where they are not known. depth_m: by
     the vehicle's own gauge. restarts: how often the estimate has begun anew. reference_yaw_rad: heading of the
     reference's body, None for the origin of a net. is_north_true: whether north is true north, not magnetic.
     behind_s: how far stamp_ns is behind the newest attitude that has come.
@@ -240,7 +240,12 @@ class Placing:
         newest_ns = max(
             (stream.newest_ns for stream in self._attitudes.values() if stream.newest_ns is not None), default=stamp_ns
         )
-        return replace(placed, depth_m=self._depth_m, restarts=self._restarts, behind_s=(newest_ns - stamp_ns) / S_NS)
+        depth_m, info = self._depth_m, self._infos[self.vehicle]
+        if depth_m is not None:
+            # The gauge's port is not the camera.
+            R_body_camera = quat_to_matrix(np.array(info.q_body_camera_xyzw))
+            depth_m -= float((placed.R_ned_body @ (R_body_camera @ np.array(info.depth_port_m)))[2])
+        return replace(placed, depth_m=depth_m, restarts=self._restarts, behind_s=(newest_ns - stamp_ns) / S_NS)
 
 
 def _is_sound(placed: Placed) -> bool:
