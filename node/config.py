@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -39,6 +40,8 @@ Fraction = Annotated[float, Meta(ge=0, le=1)]
 MAX_IMU_DELAY_NS = 100_000_000
 # Largest distance of a principal point from the middle, of the picture's size: real lenses stay within a third of it.
 OFF_CENTRE = 0.15
+# No diver carries a longer bar: it is given in millimetres.
+LONGEST_BAR_M = 20.0
 
 
 class CameraConfig(Config, frozen=True, kw_only=True):
@@ -141,6 +144,9 @@ class CalibrationConfig(Config, frozen=True, kw_only=True):
         """Check what NodeInfo would refuse."""
         check_unit("q_body_camera_xyzw", self.q_body_camera_xyzw)
         check_apart(self.light_left_m, self.light_right_m)
+        apart_m = math.dist(self.light_left_m, self.light_right_m)
+        if apart_m > LONGEST_BAR_M:
+            raise ValueError(f"light_left_m, light_right_m: {apart_m:.6g} m apart; are they in millimetres?")
 
 
 class RecordConfig(Config, frozen=True, kw_only=True):
