@@ -81,7 +81,8 @@ def locate_sources(image: NDArray[np.uint8], lights: Lights, focal_px: float) ->
     halo = np.maximum(lights.radii_px[:, HALF + 1], _LEAST_PX) / glow_px
     step_px, lean, model_px2, growth_px2 = equations.solve(prior_px2, start_px - guess_px)
     leaning = np.hypot(lean[:, 0], lean[:, 1])
-    doubt = Doubt(model_px2, growth_px2, halo, leaning, focal_px / FOCAL_PX, lights.core_elongation)
+    # Larger pictures show more of what the model leaves out; smaller ones, to which nothing is fitted, no less.
+    doubt = Doubt(model_px2, growth_px2, halo, leaning, max(focal_px / FOCAL_PX, 1.0), lights.core_elongation)
     sizes = fitted()
     # Where the model does not hold, the result is the region's centre with the prior's uncertainty.
     moved = guess_px + step_px - start_px

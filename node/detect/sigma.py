@@ -29,7 +29,7 @@ class Doubt(NamedTuple):
 
     model_px2: variance of the least squares times the model's misfit. growth_px2: from the unknown growth of the glow.
     halo: radius at 0.3 of the height over that at half of it. lean: length of the glow's lean. focal: focal length over
-    FOCAL_PX, of the picture. elongation: of the core.
+    FOCAL_PX, of the picture, at least 1. elongation: of the core.
     """
 
     model_px2: Floats

@@ -48,7 +48,11 @@ def test_each_lamp_counts_once_with_its_nearest_place():
 
 
 @pytest.mark.slow
-def test_the_shipped_sigma_is_true_in_fresh_waters():
+@pytest.mark.parametrize(("sizes", "far"), [(scenes.SIZES, scenes.FAR), (((320, 240),), (1.3, 2.0))])
+def test_the_shipped_sigma_is_true_in_fresh_waters(monkeypatch, sizes, far):
+    """Also of far lamps in pictures smaller than those that it is fitted to."""
+    monkeypatch.setattr(scenes, "SIZES", sizes)
+    monkeypatch.setattr(scenes, "FAR", far)
     errors = list(sigma.simulated(range(3001, 3007), Progress("test", 1, io.StringIO())))
     nees, beyond = truth_of(errors, fitted())
     assert 0.7 < nees < 1.4
