@@ -99,8 +99,11 @@ def _explain(error: str, table: dict[str, Any], schema: type[msgspec.Struct]) ->
         return error
     if not field:
         return error
-    where = f"[{field}] " if isinstance(value, dict) else f"{field} = {value!r}: "
-    return where + without_field(error, field)
+    error = without_field(error, field)
+    if not isinstance(value, dict):
+        return f"{field} = {value!r}: {error}"
+    # What a table checks by itself begins with its keys.
+    return f"{field}.{error}" if re.match(r"\w+: ", error) else f"[{field}] {error}"
 
 
 def _keys_at(schema: type[msgspec.Struct], field: str) -> list[str]:

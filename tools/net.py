@@ -98,15 +98,16 @@ def find(paths: Sequence[str], still: Sequence[str], net: str) -> dict[str, Stan
         for node in still:
             if node not in infos:
                 raise BuddylineError(f"{dive.name}: no NodeInfo of node {node}; nodes: {', '.join(sorted(infos))}")
-        attitudes, depths = [], []
+        attitudes, headings_rad, depths = [], [], []
         for envelope in dive.messages("attitude", "depth"):
             if isinstance(envelope.message, Attitude) and envelope.message.node == origin:
                 attitudes.append(quat_to_matrix(np.array(envelope.message.q_ned_body_xyzw)))
+                headings_rad.append(envelope.message.sigma_rad[2])
             elif isinstance(envelope.message, Depth) and envelope.message.node == origin:
                 depths.append(envelope.message.depth_m)
         if not attitudes:
             raise BuddylineError(f"{dive.name}: no attitude of node {origin}: its compass must say where north is")
-        _check_still(origin, np.array(attitudes))
+        _check_still(origin, np.array(attitudes), float(np.median(headings_rad)))
         R_body_camera = quat_to_matrix(np.array(infos[origin].q_body_camera_xyzw))
         R = _mean_rotation(np.array(attitudes)) @ R_body_camera
         port_m = float((R @ np.array(infos[origin].depth_port_m))[2])
@@ -137,17 +138,23 @@ def find(paths: Sequence[str], still: Sequence[str], net: str) -> dict[str, Stan
     return stands
 
 
-def _check_still(node: str, R_ned_body: NDArray[np.float64]) -> None:
-    """Raise BuddylineError where a node's own attitudes (N, 3, 3) say that it did not stand still."""
-    import numpy as np
+def _check_still(node: str, R_ned_body: NDArray[np.float64], heading_sigma_rad: float) -> None:
+    """Raise BuddylineError where a node's own attitudes (N, 3, 3) say that it did not stand still.
 
-    down = R_ned_body[:, 2]
-    # The mean of unit vectors is shorter than one by half of their mean square angle from it.
-    tilt_rad = math.sqrt(max(2.0 * (1.0 - float(np.linalg.norm(down.mean(axis=0)))), 0.0))
-    if tilt_rad > STILL_TILT_RAD:
-        raise BuddylineError(
-            f"node {node}: does not stand still: its tilt scatters by {math.degrees(tilt_rad):.1f} deg"
-        )
+    heading_sigma_rad: as they state it. A compass's own errors are that large over many dives, and vary less in one.
+    """
+    from buddyline.solver_service.geometry.rotation import rotation_log
+
+    off_rad = rotation_log(R_ned_body @ _mean_rotation(R_ned_body).T)
+    for what, turned_rad, most_rad in (
+        ("tilt", off_rad[:, :2], STILL_TILT_RAD),
+        ("heading", off_rad[:, 2:], heading_sigma_rad),
+    ):
+        scatter_rad = math.sqrt(float((turned_rad**2).sum(axis=1).mean()))
+        if scatter_rad > most_rad:
+            raise BuddylineError(
+                f"node {node}: does not stand still: its {what} scatters by {math.degrees(scatter_rad):.1f} deg"
+            )
 
 
 def _stand(node: str, poses: Sequence[NodePose], net: str) -> Stand:

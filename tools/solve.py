@@ -19,7 +19,7 @@ from buddyline.protocol.divelog import DiveLogWriter
 from buddyline.protocol.envelope import Envelope
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.health import CLOCKS_APART_S
-from buddyline.protocol.messages import CompressedImage, FixedPlace, Message, NodeInfo, NodePose, SolverStatus, Track
+from buddyline.protocol.messages import CompressedImage, Message, NodeInfo, NodePose, SolverStatus, Track
 from buddyline.protocol.topics import TRACK
 from buddyline.solver_service.clock_curve import ClockCurve
 from buddyline.solver_service.config import SolveConfig, node_ids, track_settings
@@ -165,24 +165,18 @@ def replacements(given: list[str]) -> dict[str, NodeInfo]:
 
 def placed(given: list[str], infos: Mapping[str, NodeInfo]) -> dict[str, NodeInfo]:
     """Return the calibrations of the nodes of `--place NODE=FILE`, with their places."""
+    if not given:
+        return {}
+    from buddyline.node.config import PlaceConfig
+
     found: dict[str, NodeInfo] = {}
     for node, path in node_files("--place", given):
         if node not in infos:
             raise ConfigError(f"--place {node}={path}: no NodeInfo of node {node}; nodes: {', '.join(sorted(infos))}")
         if node in found:
             raise ConfigError(f"--place {node}={path}: node {node} has a place already")
-        found[node] = replace(infos[node], fixed=_load_place(path))
+        found[node] = replace(infos[node], fixed=load_config(path, PlaceConfig).fixed.place)
     return found
-
-
-def _load_place(path: str) -> FixedPlace:
-    """Read the lines that `net init` wrote; raise ConfigError naming file, field and value."""
-    from buddyline.node.config import PlaceConfig
-
-    try:
-        return load_config(path, PlaceConfig).fixed.place
-    except ValueError as error:
-        raise ConfigError(f"{path}: fixed.{error}") from error
 
 
 def nodes_of(dive: Dive, given: list[str] | None) -> list[str]:

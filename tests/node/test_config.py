@@ -57,8 +57,8 @@ def test_an_absurd_place_or_delay_is_refused_with_its_name(tmp_path, line):
         ("calibration", "light_left_m = [0.44, 0.0, 0.0]", r"\[calibration\] light_left_m, light_right_m: less than"),
         ("calibration", "light_left_m = [-440.0, 0.0, 0.0]", "440.44 m apart; are they in millimetres"),
         ("calibration", "light_left_m = [nan, 0.10, 0.00]", r"a\.toml: calibration\.light_left_m\[0\] = nan: not"),
-        ("calibration", "q_body_camera_xyzw = [0.0, 0.0, 0.0, 0.0]", r"\[calibration\] q_body_camera_xyzw: norm 0"),
-        ("sensors", "mount_xyzw = [1.0, 1.0, 0.0, 0.0]", r"\[sensors\] mount_xyzw: norm 1\.41421"),
+        ("calibration", "q_body_camera_xyzw = [0.0, 0.0, 0.0, 0.0]", r"calibration\.q_body_camera_xyzw: norm 0"),
+        ("sensors", "mount_xyzw = [1.0, 1.0, 0.0, 0.0]", r"sensors\.mount_xyzw: norm 1\.41421"),
     ],
 )
 def test_a_rig_that_cannot_be_is_refused_with_its_name(tmp_path, table, line, named):
@@ -84,7 +84,7 @@ def test_role_and_fixed_place_go_into_node_info():
 @pytest.mark.parametrize(
     ("table", "named"),
     [
-        ("p_m = [0.0, 0.0, 1.0]\nq_xyzw = [0.5, 0.5, 0.5, 0.9]", r"a\.toml: \[fixed\] q_xyzw: norm"),
+        ("p_m = [0.0, 0.0, 1.0]\nq_xyzw = [0.5, 0.5, 0.5, 0.9]", r"a\.toml: fixed\.q_xyzw: norm"),
         ("p_m = [0.0, 1.0]\nq_xyzw = [0.5, 0.5, 0.5, 0.5]", "fixed.p_m"),
         ("q_xyzw = [0.5, 0.5, 0.5, 0.5]", "p_m"),
         ("p_m = [0.0, 0.0, 1.0]\nq_xyzw = [0.5, 0.5, 0.5, 0.5]\nnet = 'Main'", "fixed.net"),

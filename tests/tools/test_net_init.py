@@ -1,15 +1,18 @@
 """`buddyline net init`: where nodes on tripods stand, from a short dive."""
 
 import json
+import math
 import tomllib
 
 import numpy as np
 import pytest
 from buddyline.node.config import load_node_config
 from buddyline.protocol.divelog import DiveLogReader
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NodeInfo
-from buddyline.solver_service.geometry.rotation import quat_to_matrix, rotation_log
+from buddyline.solver_service.geometry.rotation import quat_to_matrix, rotation_exp, rotation_log
 from buddyline.tools.cli import main
+from buddyline.tools.net import _check_still
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +77,16 @@ def test_one_node_alone_is_the_origin(dive, capsys):
 def test_an_origin_that_swims_is_no_origin(dive, capsys):
     assert main(["net", "init", str(dive[0]), "--still", "b"]) == 2
     assert "node b: does not stand still: its tilt scatters by" in capsys.readouterr().err
+
+
+def test_an_origin_that_turns_on_its_tripod_is_no_origin():
+    """By more than a compass's own noise, which a node that stands has, too."""
+    rng = np.random.default_rng(3)
+    noise_rad, sigma_rad = np.radians(2.0) * rng.normal(size=200), math.radians(4.0)
+    up = np.array((0.0, 0.0, 1.0))
+    _check_still("a", rotation_exp((1.0 + noise_rad)[:, None] * up), sigma_rad)
+    with pytest.raises(BuddylineError, match=r"node a: does not stand still: its heading scatters by 8\.\d deg"):
+        _check_still("a", rotation_exp((np.linspace(0.0, 0.5, 200) + noise_rad)[:, None] * up), sigma_rad)
 
 
 def test_a_node_named_twice_is_said(dive, capsys):
