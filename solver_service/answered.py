@@ -133,11 +133,9 @@ class Answered:
         """Note a frame that was sent after this solver joined; return what was withheld and is to be published now."""
         due: list[Message] = []
         for nodes in pairs:
-            pair = self.pair(nodes)
-            knew = pair.knows
-            due += pair.saw_new_frame(trigger, stamp_ns)
-            if knew and not pair.knows:
-                due += self._rows.release()
+            withheld = self.pair(nodes).saw_new_frame(trigger, stamp_ns)
+            if withheld is not None:
+                due += [*withheld, *self._rows.release()]
         return due
 
     def take_over(self, nodes: tuple[str, str], said: Iterable[Answer]) -> int:
@@ -207,11 +205,6 @@ class AnsweredPair:
         self._open: set[int] = set()
         self._withheld: deque[Outcome] = deque(maxlen=MAX_WITHHELD)
 
-    @property
-    def knows(self) -> bool:
-        """Whether triggers of this dive were answered before."""
-        return self._up_to is not None
-
     def is_of_another_dive(self, outcome: Outcome) -> bool:
         """Return whether an outcome's trigger is after all that were answered, and its stamp a second before the last.
 
@@ -254,12 +247,12 @@ class AnsweredPair:
         live = self._up_to is not None and abs(now_ns - self.up_to_ns) < THIS_DIVE_NS
         return live and stamp_ns < self.up_to_ns - WARM_UP_NS
 
-    def saw_new_frame(self, trigger: int, stamp_ns: int) -> list[Outcome]:
-        """Note a new frame; return the withheld outcomes if its trigger number was answered before, else nothing."""
+    def saw_new_frame(self, trigger: int, stamp_ns: int) -> list[Outcome] | None:
+        """Note a new frame; return the withheld outcomes if it shows that the dive is another one, else None."""
         if self._up_to is None or trigger > self._up_to:
-            return []
+            return None
         if self._taken_over and stamp_ns > self.up_to_ns - WARM_UP_NS:
-            return []
+            return None
         due = list(self._withheld)
         self._withheld.clear()
         self._up_to = None

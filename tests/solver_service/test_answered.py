@@ -38,13 +38,13 @@ def unsaid(answered, ks):
 def test_the_first_solver_says_everything():
     answered = AnsweredPair()
     assert unsaid(answered, range(5)) == list(range(5))
-    assert answered.saw_new_frame(0, 0) == []
+    assert answered.saw_new_frame(0, 0) is None
 
 
 def test_what_was_said_is_not_said_again_and_what_was_not_is():
     answered = AnsweredPair(map(answer_of, [outcome(3), outcome(7)]))
     assert unsaid(answered, range(12)) == [8, 9, 10, 11]
-    assert answered.saw_new_frame(12, 12) == []
+    assert answered.saw_new_frame(12, 12) is None
     assert unsaid(answered, [5, 12]) == [12]
 
 
