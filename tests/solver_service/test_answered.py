@@ -1,6 +1,7 @@
 """A solver that is started again says what has not been said, and nothing twice."""
 
 from collections import Counter
+from contextlib import contextmanager
 from itertools import pairwise
 
 import pytest
@@ -157,46 +158,78 @@ def test_of_a_live_dive_only_the_last_moments_are_solved_again():
         assert not AnsweredPair().is_over(now_ns - age_s * S_NS, now_ns)
 
 
+OUTCOMES = "buddyline/pair/*/*/pose", "buddyline/pair/*/*/rejected"
+TRACKS = "buddyline/pair/*/*/track", "buddyline/pair/*/*/track_lag"
+
+
+@contextmanager
+def heard(network, keys):
+    """What a viewer receives on these keys."""
+    received = []
+    with network.connect() as viewer:
+        viewer.subscribe(keys, received.append, capacity=10_000)
+        yield received
+
+
+@contextmanager
+def solver_on(network, clock, config=None):
+    """A solver on a bus of its own."""
+    with network.connect() as bus:
+        service = SolverService(config or SolverConfig(nodes=["a", "b"]), clock=clock)
+        service.attach(bus)
+        yield service
+
+
+def flush(service):
+    with service._lock:
+        service._publish(service.core.flush())
+
+
+def opened(received):
+    return decode(received.payload, parse_key(received.key)[0].schema)
+
+
+def triggers_of(received):
+    return Counter(opened(one).trigger for one in received)
+
+
+class Divers:
+    """The nodes of a dive: their caches hold what they have published, also when no solver runs."""
+
+    def __init__(self, nodes, clock, messages):
+        self.clock = clock
+        self.publishers = {key: nodes.publisher(parse_key(key)[0], *parse_key(key)[1]) for key in map(key_of, messages)}
+
+    def publish(self, messages, service=None):
+        """Publish messages, each at its time, which does not run ahead of the solver."""
+        for message in messages:
+            self.clock.set_ns(max(self.clock.now_ns() + 1, message.stamp_ns))
+            self.publishers[key_of(message)].put(message)
+            if service is not None and isinstance(message, Candidates):
+                stream = service.core.streams[message.node]
+                until(lambda stream=stream, ns=message.stamp_ns: (stream.newest_ns or 0) >= ns)
+
+
 @pytest.mark.parametrize("live", [True, False], ids=["live", "stored"])
 def test_two_solvers_one_after_the_other_answer_every_trigger_once(live):
     """The first is gone between two frames; the second comes some frames later, and finds them in the caches."""
     messages, _ = dive_messages(seconds=14.0, sensors=False, period_ns=2 * PERIOD_NS)
     gone_at, back_at = len(messages) * 8 // 10, len(messages) * 9 // 10
     clock = ManualClock(START_NS if live else START_NS + 86_400 * S_NS)
-    network, outcomes = LocalNetwork(clock), []
-    with network.connect() as nodes, network.connect() as viewer:
-        publishers = {key: nodes.publisher(parse_key(key)[0], *parse_key(key)[1]) for key in map(key_of, messages)}
-        viewer.subscribe(("buddyline/pair/*/*/pose", "buddyline/pair/*/*/rejected"), outcomes.append, capacity=10_000)
-
-        def publish(part, service=None):
-            for message in part:
-                clock.set_ns(max(clock.now_ns() + 1, message.stamp_ns))
-                publishers[key_of(message)].put(message)
-                if service is not None and isinstance(message, Candidates):
-                    # Time must not run ahead of the solver.
-                    stream = service.core.streams[message.node]
-                    until(lambda stream=stream, ns=message.stamp_ns: (stream.newest_ns or 0) >= ns)
-
-        def solver(bus, part):
-            service = SolverService(SolverConfig(nodes=["a", "b"]), clock=clock)
-            service.attach(bus)
-            publish(part, service)
-            return service
-
-        with network.connect() as bus:
-            solver(bus, messages[:gone_at])
-        publish(messages[gone_at:back_at])
-        with network.connect() as bus:
-            service = solver(bus, messages[back_at:])
-            with service._lock:
-                service._publish(service.core.flush())
+    network = LocalNetwork(clock)
+    with network.connect() as nodes, heard(network, OUTCOMES) as outcomes:
+        divers = Divers(nodes, clock, messages)
+        with solver_on(network, clock) as service:
+            divers.publish(messages[:gone_at], service)
+        divers.publish(messages[gone_at:back_at])
+        with solver_on(network, clock) as service:
+            divers.publish(messages[back_at:], service)
+            flush(service)
             # Of a dive of now, what was answered long ago is not even looked at.
             frames = sum(isinstance(message, Candidates) for message in messages)
             assert (sum(stream.received for stream in service.core.streams.values()) < frames) is live
-        until(lambda: any(payload_trigger(one) == messages[-1].trigger for one in outcomes))
-    counts = Counter(payload_trigger(one) for one in outcomes)
-    assert set(counts) == {message.trigger for message in messages if isinstance(message, Candidates)}
-    assert set(counts.values()) == {1}
+        until(lambda: messages[-1].trigger in triggers_of(outcomes))
+    assert triggers_of(outcomes) == {message.trigger: 1 for message in messages if isinstance(message, Candidates)}
 
 
 @pytest.mark.parametrize(
@@ -208,34 +241,19 @@ def test_two_solvers_one_after_the_other_tell_every_row_of_the_tracks_once(live,
     gone_at, back_at = len(messages) * 7 // 10, len(messages) * 8 // 10
     clock = ManualClock(START_NS if live else START_NS + 86_400 * S_NS)
     config = SolverConfig(nodes=["a", "b"], journal=str(tmp_path / "answered"))
-    network, rows = LocalNetwork(clock), []
-    with network.connect() as nodes, network.connect() as viewer:
-        publishers = {key: nodes.publisher(parse_key(key)[0], *parse_key(key)[1]) for key in map(key_of, messages)}
-        viewer.subscribe(("buddyline/pair/*/*/track", "buddyline/pair/*/*/track_lag"), rows.append, capacity=10_000)
-
-        def publish(part, service=None):
-            for message in part:
-                clock.set_ns(max(clock.now_ns() + 1, message.stamp_ns))
-                publishers[key_of(message)].put(message)
-                if service is not None and isinstance(message, Candidates):
-                    stream = service.core.streams[message.node]
-                    until(lambda stream=stream, ns=message.stamp_ns: (stream.newest_ns or 0) >= ns)
-
-        with network.connect() as bus:
-            service = SolverService(config, clock=clock)
-            service.attach(bus)
-            publish(messages[:gone_at], service)
+    network = LocalNetwork(clock)
+    with network.connect() as nodes, heard(network, TRACKS) as rows:
+        divers = Divers(nodes, clock, messages)
+        with solver_on(network, clock, config) as service:
+            divers.publish(messages[:gone_at], service)
         until(lambda: len(rows) > 100)
         first = stamps_of(rows)
         if not held:
             network.newest.clear()
-        publish(messages[gone_at:back_at])
-        with network.connect() as bus:
-            service = SolverService(config, clock=clock)
-            service.attach(bus)
-            publish(messages[back_at:], service)
-            with service._lock:
-                service._publish(service.core.flush())
+        divers.publish(messages[gone_at:back_at])
+        with solver_on(network, clock, config) as service:
+            divers.publish(messages[back_at:], service)
+            flush(service)
         until(lambda: all(max(of) > messages[-1].stamp_ns - S_NS for of in stamps_of(rows).values()))
     for name, stamps_ns in stamps_of(rows).items():
         again = [stamp_ns for stamp_ns, count in Counter(stamps_ns).items() if count > 1]
@@ -252,10 +270,6 @@ def stamps_of(rows):
     return found
 
 
-def payload_trigger(received):
-    return decode(received.payload, parse_key(received.key)[0].schema).trigger
-
-
 @pytest.mark.parametrize("player", [False, True], ids=["held up", "played"])
 def test_what_a_link_held_up_is_not_answered_again(player):
     """B's frames come after the solver that was started again: an earlier one has answered their triggers."""
@@ -263,19 +277,15 @@ def test_what_a_link_held_up_is_not_answered_again(player):
     frames = [one for one in messages if isinstance(one, Candidates)]
     last = max(frames, key=lambda frame: frame.stamp_ns)
     clock = ManualClock(last.stamp_ns + S_NS)
-    network, outcomes = LocalNetwork(clock), []
-    with network.connect() as bus, network.connect() as viewer:
-        viewer.subscribe(("buddyline/pair/*/*/pose", "buddyline/pair/*/*/rejected"), outcomes.append, capacity=10_000)
-        service = SolverService(SolverConfig(nodes=["a", "b"]), clock=clock)
-        service.attach(bus)
+    network = LocalNetwork(clock)
+    with heard(network, OUTCOMES) as outcomes, solver_on(network, clock) as service:
         service.watch("player", player)
         said = Rejected(node_a="a", node_b="b", stamp_ns=last.stamp_ns, trigger=last.trigger, reason="unmatched")
         service._answered = Answered(map(answer_of, [said]))
         for message in messages:
             clock.set_ns(clock.now_ns() + 1)
             service.receive(Received(key_of(message), encode(message), clock.now_ns(), ""))
-        with service._lock:
-            service._publish(service.core.flush())
+        flush(service)
     assert bool(outcomes) is player
 
 
@@ -291,7 +301,7 @@ def test_what_a_killed_solver_could_not_tell_the_next_one_tells(tmp_path, monkey
     frames = [one for one in messages if isinstance(one, Candidates)]
     last = max(frames, key=lambda frame: frame.stamp_ns)
     clock = ManualClock(last.stamp_ns + S_NS)
-    network, outcomes, deaf = LocalNetwork(clock), [], False
+    network, deaf = LocalNetwork(clock), False
     send = LocalPublisher._send
 
     def send_unless_deaf(publisher, payload, **how):
@@ -299,16 +309,8 @@ def test_what_a_killed_solver_could_not_tell_the_next_one_tells(tmp_path, monkey
 
     monkeypatch.setattr(LocalPublisher, "_send", send_unless_deaf)
     config = SolverConfig(nodes=["a", "b"], journal=str(tmp_path / "answered"))
-
-    def solver(bus):
-        service = SolverService(config, clock=clock)
-        service.attach(bus)
-        return service
-
-    with network.connect() as viewer:
-        viewer.subscribe(("buddyline/pair/*/*/pose", "buddyline/pair/*/*/rejected"), outcomes.append, capacity=10_000)
-        with network.connect() as bus:
-            service = solver(bus)
+    with heard(network, OUTCOMES) as outcomes:
+        with solver_on(network, clock, config) as service:
             for i, message in enumerate(messages):
                 deaf = i > len(messages) // 2
                 clock.set_ns(clock.now_ns() + 1)
@@ -316,24 +318,20 @@ def test_what_a_killed_solver_could_not_tell_the_next_one_tells(tmp_path, monkey
                     feed(service, message)
             assert service.core.pending
             until(lambda: outcomes)
-            heard = len(outcomes)
+            before = len(outcomes)
         deaf = False
         monkeypatch.setattr(owed, "OWED_S", 0.0)
         for _ in range(3):
-            with network.connect() as bus:
-                service = solver(bus)
+            with solver_on(network, clock, config) as service:
                 service.tick(status_due=False)
                 # They come after all: nothing is answered again.
                 for message in messages:
                     clock.set_ns(clock.now_ns() + 1)
                     feed(service, message)
-                with service._lock:
-                    service._publish(service.core.flush())
-        until(lambda: payload_trigger(outcomes[-1]) == last.trigger)
-    assert 0 < heard < len(outcomes) - 5
-    counts = Counter(payload_trigger(one) for one in outcomes)
-    assert set(counts) == {frame.trigger for frame in frames}
-    assert set(counts.values()) == {1}
+                flush(service)
+        until(lambda: opened(outcomes[-1]).trigger == last.trigger)
+    assert 0 < before < len(outcomes) - 5
+    assert triggers_of(outcomes) == {frame.trigger: 1 for frame in frames}
 
 
 def test_what_waited_when_a_solver_was_killed_has_an_outcome(tmp_path, monkeypatch):
@@ -341,48 +339,40 @@ def test_what_waited_when_a_solver_was_killed_has_an_outcome(tmp_path, monkeypat
     messages, _ = dive_messages(seconds=6.0, sensors=False, period_ns=2 * PERIOD_NS)
     frames = sorted((one for one in messages if isinstance(one, Candidates)), key=lambda frame: frame.stamp_ns)
     clock = ManualClock(frames[-1].stamp_ns + S_NS)
-    network, outcomes = LocalNetwork(clock), []
+    network = LocalNetwork(clock)
     config = SolverConfig(nodes=["a", "b"], journal=str(tmp_path / "answered"))
     third = len(frames) // 6 * 2
 
-    def nodes_and_solver(bus, part, *, stuck_from):
+    def nodes_and_solver(part, *, stuck_from):
         """Nodes send these frames and end; the solver handles none from one on, and is killed."""
-        service = SolverService(config, clock=clock)
-        service.attach(bus)
-        with network.connect() as nodes:
-            publishers = {node: nodes.publisher(CANDIDATES, node) for node in ("a", "b")}
-            for k, frame in enumerate(part):
-                clock.set_ns(clock.now_ns() + 1)
-                if k == stuck_from:
+        with solver_on(network, clock, config) as service:
+            with network.connect() as nodes:
+                publishers = {node: nodes.publisher(CANDIDATES, node) for node in ("a", "b")}
+                for k, frame in enumerate(part):
+                    clock.set_ns(clock.now_ns() + 1)
+                    if k == stuck_from:
+                        until(lambda: service._handled == stuck_from)
+                        service._lock.acquire()
+                    publishers[frame.node].put(frame)
+                if len(part) == stuck_from:
                     until(lambda: service._handled == stuck_from)
                     service._lock.acquire()
-                publishers[frame.node].put(frame)
-            if len(part) == stuck_from:
-                until(lambda: service._handled == stuck_from)
-                service._lock.acquire()
-        service.stop.set()
-        service._publish(service.core.flush() if len(part) == stuck_from else [])
-        service._lock.release()
+            service.stop.set()
+            service._publish(service.core.flush() if len(part) == stuck_from else [])
+            service._lock.release()
 
-    with network.connect() as viewer:
-        viewer.subscribe(("buddyline/pair/*/*/pose", "buddyline/pair/*/*/rejected"), outcomes.append, capacity=10_000)
-        with network.connect() as bus:
-            nodes_and_solver(bus, frames[: 2 * third], stuck_from=third)
-        with network.connect() as bus:
-            nodes_and_solver(bus, frames[2 * third :], stuck_from=len(frames) - 2 * third)
+    with heard(network, OUTCOMES) as outcomes:
+        nodes_and_solver(frames[: 2 * third], stuck_from=third)
+        nodes_and_solver(frames[2 * third :], stuck_from=len(frames) - 2 * third)
         monkeypatch.setattr(owed, "OWED_S", 0.0)
         for _ in range(2):
-            with network.connect() as bus:
-                service = SolverService(config, clock=clock)
-                service.attach(bus)
+            with solver_on(network, clock, config) as service:
                 service.tick(status_due=False)
         until(lambda: len(outcomes) >= len(frames) // 2)
-    counts = Counter(payload_trigger(one) for one in outcomes)
-    assert set(counts) == {frame.trigger for frame in frames}
-    assert set(counts.values()) == {1}
-    late = {payload_trigger(one) for one in outcomes if b'"late"' in one.payload}
+    assert triggers_of(outcomes) == {frame.trigger: 1 for frame in frames}
+    late = {opened(one).trigger for one in outcomes if b'"late"' in one.payload}
     waited = {frame.trigger for frame in frames[third : 2 * third]}
-    assert waited <= late < set(counts)
+    assert waited <= late < {frame.trigger for frame in frames}
 
 
 def test_a_refused_frame_ends_no_later_solver(tmp_path, monkeypatch):
@@ -417,11 +407,7 @@ def test_what_has_come_again_is_not_given_up_while_it_waits(tmp_path, monkeypatc
     killed._journal.add([Rejected(node_a="a", node_b="b", stamp_ns=1, trigger=1, reason="ambiguous")])
     for frame in frames:
         killed._note_arrival(key_of(frame), encode(frame))
-    outcomes = []
-    with network.connect() as viewer, network.connect() as bus:
-        viewer.subscribe(("buddyline/pair/*/*/pose", "buddyline/pair/*/*/rejected"), outcomes.append, capacity=10_000)
-        service = SolverService(config, clock=clock)
-        service.attach(bus)
+    with heard(network, OUTCOMES) as outcomes, solver_on(network, clock, config) as service:
         # The last frames were lost with their nodes.
         come = [one for one in messages if not (isinstance(one, Candidates) and one.stamp_ns == last_ns)]
         for message in come:
@@ -430,15 +416,10 @@ def test_what_has_come_again_is_not_given_up_while_it_waits(tmp_path, monkeypatc
         for message in come:
             clock.set_ns(clock.now_ns() + 1)
             service.receive(Received(key_of(message), encode(message), clock.now_ns(), ""))
-        with service._lock:
-            service._publish(service.core.flush())
+        flush(service)
         until(lambda: len(outcomes) >= len(frames) // 2)
-    assert Counter(payload_trigger(one) for one in outcomes) == {frame.trigger: 1 for frame in frames}
+    assert triggers_of(outcomes) == {frame.trigger: 1 for frame in frames}
     assert [one.stamp_ns for one in map(opened, outcomes) if getattr(one, "reason", "") == "late"] == [last_ns]
-
-
-def opened(received):
-    return decode(received.payload, parse_key(received.key)[0].schema)
 
 
 def test_what_another_solver_may_have_answered_is_not_expected():
