@@ -62,13 +62,14 @@ def _rows_together(
     near = np.where(share < 1.0, one, two)
     return rows_of(
         stamps_ns,
+        times_s,
         between,
         P + _unseen(path, between, two, span_s, weights),
         _mixed(share, path.rates_radps[one], path.rates_radps[two]),
-        path.lights[near],
-        np.maximum(times_s - path.light_s[near], 0.0),
-        path.north_doubt[two],
-        path.nearest_lit_m[near],
+        [
+            path.statuses[i]._replace(north_doubt=path.statuses[j].north_doubt, lit_m=lit_m)
+            for i, j, lit_m in zip(near.tolist(), two.tolist(), path.nearest_lit_m[near].tolist(), strict=True)
+        ],
     )
 
 

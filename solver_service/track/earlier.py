@@ -42,6 +42,6 @@ class EarlierFilter(TrackFilter):
                     return None
         F, Q, walk = self._move(estimate, start_s)
         rates_radps = path.rates_radps[min(1, len(path) - 1)]
-        last = Step(start_s, estimate.state.row, path.states[0], path.oldest, F, Q, walk, rates_radps, since_s, 0)
+        last = Step(start_s, estimate.state.row, path.states[0], path.oldest, F, Q, walk, rates_radps, estimate.status)
         estimate.steps.append(last)
         return smoothed(estimate.steps)

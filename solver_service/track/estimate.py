@@ -13,7 +13,7 @@ from buddyline.solver_service.geometry.rotation import Floats, rotation_log
 from buddyline.solver_service.track.scale import ScaleGap
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.state import MOVING, PHI, SIZE, State
-from buddyline.solver_service.track.trail import Chosen, Trail
+from buddyline.solver_service.track.trail import Chosen, EstimateStatus, Trail
 from buddyline.solver_service.track.vibration import SHARES, Shares
 from buddyline.solver_service.track.walking import Walking
 
@@ -142,6 +142,11 @@ class Estimate:
     def lights(self) -> int:
         """Give how many lights the last trigger's pictures told."""
         return len({(observer, light) for _, observer, light in self.trigger})
+
+    @property
+    def status(self) -> EstimateStatus:
+        """What rows tell of it now, beside its state."""
+        return EstimateStatus(self.light_s, self.lit_m, self.lights, self.north_doubt)
 
     def copied(self, **changes: object) -> Estimate:
         """Give an estimate that goes its own way from here."""

@@ -438,5 +438,4 @@ class TrackFilter(TrackPool):
             self._step(main, main.t_s + TICK_S, None)
         row = self._present(main, t_s)
         self._last_row = main, row
-        age_s = t_s - main.light_s
-        return DueRow(stamp_ns, row, main.rates_radps, main.lights, age_s, main.north_doubt, main.lit_m)
+        return DueRow(stamp_ns, row, main.rates_radps, main.status)

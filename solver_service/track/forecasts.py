@@ -26,6 +26,7 @@ from buddyline.solver_service.track.strapdown import (
     propagate,
     sampled,
 )
+from buddyline.solver_service.track.trail import EstimateStatus
 
 # So many are worked out at once at most, and at least, of tracks and of rows: few rotations are worked out otherwise
 # (geometry/rotation.py), and a row is to be the same to the last bit whichever others are made with it.
@@ -142,22 +143,11 @@ def _block_after(P: Floats, F: Floats, Q: Floats, walk: Floats) -> Floats:
 class DueRow:
     """A row that is to be told, and what it is made of: the track at its time, and how its lights were.
 
-    rates_radps (2, 3): of the track's last step. age_s: since the last light, of so many of the last trigger.
-    north_doubt: as of the estimate. lit_m: the range at the last light.
+    rates_radps (2, 3), status: of the track's last step.
     """
 
-    def __init__(
-        self,
-        stamp_ns: int,
-        forecast: Forecast,
-        rates_radps: Floats,
-        lights: int,
-        age_s: float,
-        north_doubt: float,
-        lit_m: float,
-    ) -> None:
-        self.stamp_ns, self.forecast, self.rates_radps = stamp_ns, forecast, rates_radps
-        self.lights, self.age_s, self.north_doubt, self.lit_m = lights, age_s, north_doubt, lit_m
+    def __init__(self, stamp_ns: int, forecast: Forecast, rates_radps: Floats, status: EstimateStatus) -> None:
+        self.stamp_ns, self.forecast, self.rates_radps, self.status = stamp_ns, forecast, rates_radps, status
         self._rows: list[TrackRow | None] = []
 
     @property
@@ -187,13 +177,11 @@ def make_rows(due: Iterable[DueRow]) -> None:
         now = [one.forecast.now for one in every]
         rows = rows_of(
             [one.stamp_ns for one in some],
+            [one.forecast.t_s for one in every],
             State(np.array([each.row for each in now])),
             np.array([each.covariance for each in now]),
             np.array([one.rates_radps for one in every]),
-            np.array([one.lights for one in every]),
-            np.array([one.age_s for one in every]),
-            np.array([one.north_doubt for one in every]),
-            np.array([one.lit_m for one in every]),
+            [one.status for one in every],
         )
         for one, row in zip(some, rows, strict=True):
             one.take(row)

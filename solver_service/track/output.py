@@ -12,7 +12,7 @@ from buddyline.solver_service.geometry.rotation import Floats, inner, matrix_to_
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.lights import COLUMNS
 from buddyline.solver_service.track.state import NAV, PHI, R_, V_, State
-from numpy.typing import NDArray
+from buddyline.solver_service.track.trail import EstimateStatus
 
 # A position no better than this share of the range is not told: of the range that it tells, and of that at the light
 # nearest in time. Without lights an estimate drifts, and the farther it has drifted the more such a share of it is.
@@ -122,18 +122,16 @@ def _bent(C: Floats) -> Floats:
 
 def rows_of(
     stamps_ns: Sequence[int],
+    times_s: Sequence[float] | Floats,
     states: State,
     P: Floats,
     rates_radps: Floats,
-    lights: NDArray[np.int64],
-    ages_s: Floats,
-    north_doubts: Floats,
-    lit_m: Floats,
+    statuses: Sequence[EstimateStatus],
 ) -> list[TrackRow | None]:
     """Give the rows of a batch of states (N), None where a position is no better than WORST_SHARE of the range.
 
-    P (N, C, C): the covariances of COLUMNS. north_doubts (N,): variances of what turns all about the vertical, which
-    only what is told in north-east-down has. lit_m (N,): the ranges at the lights nearest in time.
+    times_s: of the stamps, by the track. P (N, C, C): the covariances of COLUMNS. statuses: with lit_m at the lights
+    nearest in time. Only what is told in north-east-down has their north_doubt: it turns all about the vertical.
     """
     now = at_one_time(states, rates_radps)
     toward = np.swapaxes(now.R[:, 0], -1, -2)
@@ -141,6 +139,8 @@ def rows_of(
     whole = J @ P @ np.swapaxes(J, -1, -2)
     whole[:, :3, :3] += _bent(whole[:, :6, :6])
     ranges_m = np.sqrt(inner(now.r_m, now.r_m))
+    lit_m = np.array([status.lit_m for status in statuses])
+    north_doubts = np.array([status.north_doubt for status in statuses])
     told = np.isfinite(whole).all(axis=(1, 2))
     told &= np.sqrt(np.trace(whole[:, :3, :3], axis1=1, axis2=2)) <= WORST_SHARE * np.minimum(ranges_m, lit_m)
     turned_m = now.r_m @ _ABOUT_DOWN
@@ -157,8 +157,8 @@ def rows_of(
             covariance=whole[i, :6, :6],
             v_a_b_mps=v[i],
             v_covariance=whole[i, 6:9, 6:9],
-            lights=int(lights[i]),
-            age_s=float(ages_s[i]),
+            lights=statuses[i].lights,
+            age_s=max(float(times_s[i]) - statuses[i].light_s, 0.0),
             range_m=float(ranges_m[i]),
             t_ned_m=now.r_m[i],
             sigma_ned_m=sigma_ned_m[i],

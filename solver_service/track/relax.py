@@ -235,8 +235,7 @@ class PathPass(TrackSteps):
         self._off = before
         self._take_attitude(main, at_s)
         self._take_turning(main, at_s)
-        so_far = main.light_s, main.lights, main.north_doubt
-        return Step(at_s, before, before, main.covariance, F, Q, walk, main.rates_radps, *so_far)
+        return Step(at_s, before, before, main.covariance, F, Q, walk, main.rates_radps, main.status)
 
     def _seen(self, step: Step, seen: Sequence[tuple[Sight, BySight]]) -> Step:
         """Take the depths and the pictures of a step together."""
@@ -283,12 +282,7 @@ class PathPass(TrackSteps):
                 main.told += len(y)
                 main.light_s = max(main.light_s, *(t_s for t_s, _, _ in lights))
         return replace(
-            step,
-            after=self._off,
-            covariance=main.covariance,
-            light_s=main.light_s,
-            lights=main.lights,
-            looks=(*step.looks, *looks),
+            step, after=self._off, covariance=main.covariance, status=main.status, looks=(*step.looks, *looks)
         )
 
     def _associated(self, sight: Sight, by_path: BySight) -> Association:

@@ -24,7 +24,7 @@ from buddyline.solver_service.track.state import (
     State,
 )
 from buddyline.solver_service.track.strapdown import predicted
-from buddyline.solver_service.track.trail import Look, Step, Trail
+from buddyline.solver_service.track.trail import EstimateStatus, Look, Step, Trail
 from numpy.typing import NDArray
 
 # What rows and pictures need of a covariance: of COLUMNS, half.
@@ -47,28 +47,25 @@ SWINGS: Final = 20
 class Path:
     """Smoothed steps as columns, in order of time.
 
-    t_s, light_s (N,), lights (N,), north_doubt (N,), rates_radps (N, 2, 3), lit_m (N,): of the steps. states: State.row
-    of each. halves: of the covariance of COLUMNS, its upper half. drawn (N, 6): variances that noise added in the step
-    before, of A's and B's attitude and of the velocity: by shaking, and by all else. without (N, 2): which node had no
-    inertial unit in that step. oldest (SIZE, SIZE): the whole covariance at the first step. auxiliary (N, 3, 3), where
-    it was asked for: of the step before, for the velocity and for A's and B's turn rates, the auxiliary residual's
-    square (the sum of its axes), what that is expected to be, and the variance that noise added (one axis). across (N,
-    C, C), where it was asked for: the covariance of COLUMNS of the step before (rows) with each step (columns).
+    t_s (N,), rates_radps (N, 2, 3), statuses, looks: of the steps. states: State.row of each. halves: of the covariance
+    of COLUMNS, its upper half. drawn (N, 6): variances that noise added in the step before, of A's and B's attitude and
+    of the velocity: by shaking, and by all else. without (N, 2): which node had no inertial unit in that step. oldest
+    (SIZE, SIZE): the whole covariance at the first step. auxiliary (N, 3, 3), where it was asked for: of the step
+    before, for the velocity and for A's and B's turn rates, the auxiliary residual's square (the sum of its axes), what
+    that is expected to be, and the variance that noise added (one axis). across (N, C, C), where it was asked for: the
+    covariance of COLUMNS of the step before (rows) with each step (columns).
     """
 
     t_s: Floats
-    light_s: Floats
-    lights: NDArray[np.int64]
-    north_doubt: Floats
     rates_radps: Floats
     states: Floats
     halves: Floats
     drawn: Floats
     without: NDArray[np.bool_]
+    statuses: Sequence[EstimateStatus]
     looks: Sequence[tuple[Look, ...]]
     oldest: Floats
     auxiliary: Floats
-    lit_m: Floats
     across: Floats | None = None
 
     def __len__(self) -> int:
@@ -77,10 +74,10 @@ class Path:
 
     def after(self, earlier: Path) -> Path:
         """Give this path with an earlier one before it, whose last step is its first."""
-        of_steps = "t_s", "light_s", "lights", "north_doubt", "rates_radps", "lit_m"
-        columns = (*of_steps, "states", "halves", "drawn", "without", "auxiliary")
+        columns = "t_s", "rates_radps", "states", "halves", "drawn", "without", "auxiliary"
         both = {name: np.concatenate((getattr(earlier, name)[:-1], getattr(self, name))) for name in columns}
-        return Path(**both, looks=[*earlier.looks[:-1], *self.looks], oldest=earlier.oldest)
+        statuses, looks = [*earlier.statuses[:-1], *self.statuses], [*earlier.looks[:-1], *self.looks]
+        return Path(**both, statuses=statuses, looks=looks, oldest=earlier.oldest)
 
     def later(self, clock_s: float) -> Path:
         """Give the path for one who believes B's clock to be so much further ahead."""
@@ -111,9 +108,11 @@ class Path:
         steps = np.arange(len(self))
         after, so_far = np.searchsorted(lit, steps), np.searchsorted(lit, steps, side="right")
         # The last light may be older than the path.
-        older_s = np.where(np.isfinite(self.lit_m), self.t_s - self.light_s, math.inf)
+        lit_m = np.array([status.lit_m for status in self.statuses])
+        light_s = np.array([status.light_s for status in self.statuses])
+        older_s = np.where(np.isfinite(lit_m), self.t_s - light_s, math.inf)
         since_s = np.where(so_far, self.t_s - times_s[so_far - 1], older_s)
-        before_m = np.where(so_far, ranges_m[so_far - 1], self.lit_m)
+        before_m = np.where(so_far, ranges_m[so_far - 1], lit_m)
         nearest_m: Floats = np.where(since_s <= times_s[after] - self.t_s, before_m, ranges_m[after])
         return nearest_m
 
@@ -143,22 +142,20 @@ def smoothed(
     1988). uses_up: whether the steps are let go of.
     """
     count = len(steps)
+    statuses = [EstimateStatus(math.nan)] * count
     looks: list[tuple[Look, ...]] = [()] * count
     found: list[Floats] = [np.zeros(0)] * count
     path = Path(
         t_s=np.empty(count),
-        light_s=np.empty(count),
-        lights=np.empty(count, np.int64),
-        north_doubt=np.empty(count),
         rates_radps=np.empty((count, 2, 3)),
         states=np.empty((count, ROW)),
         halves=np.empty((count, len(_UPPER[0]))),
         drawn=np.empty((count, 6)),
         without=np.empty((count, 2), dtype=bool),
+        statuses=statuses,
         looks=looks,
         oldest=np.empty((SIZE, SIZE)),
         auxiliary=np.zeros((count, 3, 3)),
-        lit_m=np.empty(count),
         across=np.zeros((count, len(COLUMNS), len(COLUMNS))) if across else None,
     )
     drawn, later = np.empty((count, *_DRAWN[0].shape)), None
@@ -183,8 +180,7 @@ def smoothed(
                 path.across[k + 1] = (gain[COLUMNS] @ P)[:, COLUMNS]
             P = step.covariance + gain @ (P - P_before) @ gain.T
             P = 0.5 * (P + P.T)
-        path.t_s[k], path.light_s[k], path.lights[k] = step.t_s, step.light_s, step.lights
-        path.north_doubt[k], path.lit_m[k] = step.north_doubt, step.lit_m
+        path.t_s[k], statuses[k] = step.t_s, step.status
         found[k], path.halves[k] = here, P[_BLOCK_UPPER]
         drawn[k] = step.Q[_DRAWN]
         path.rates_radps[k] = step.rates_radps

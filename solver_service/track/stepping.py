@@ -15,19 +15,12 @@ from buddyline.solver_service.track.ahead import StepsAhead, steps_ahead
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.inputs import TrackNode
 from buddyline.solver_service.track.intake import newest_before
-from buddyline.solver_service.track.lights import (
-    Sight,
-)
+from buddyline.solver_service.track.lights import Sight
 from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S
 from buddyline.solver_service.track.seeing import TrackSights
-from buddyline.solver_service.track.state import (
-    MOUNT,
-    MOVING,
-    SHAKE,
-    SIZE,
-)
+from buddyline.solver_service.track.state import MOUNT, MOVING, SHAKE, SIZE
 from buddyline.solver_service.track.strapdown import Increments
-from buddyline.solver_service.track.trail import Look, Step
+from buddyline.solver_service.track.trail import EstimateStatus, Look, Step
 
 # So many steps are integrated together at most.
 MOST_TOGETHER: Final = 64
@@ -89,11 +82,8 @@ class TrackSteps(TrackSights):
                     Q=moved[1],
                     walk=moved[2],
                     rates_radps=estimate.rates_radps,
-                    light_s=estimate.light_s,
-                    lights=estimate.lights,
-                    north_doubt=estimate.north_doubt,
+                    status=estimate.status,
                     looks=looks,
-                    lit_m=estimate.lit_m,
                 )
             )
             if math.isinf(self._keep_s):
@@ -110,10 +100,8 @@ class TrackSteps(TrackSights):
                 last,
                 after=estimate.state.row,
                 covariance=estimate.covariance,
-                light_s=estimate.light_s,
-                lights=estimate.lights,
+                status=estimate.status,
                 looks=last.looks + looks,
-                lit_m=estimate.lit_m,
             )
 
     def increments(self, estimate: Estimate, t_s: float) -> Increments:
@@ -203,7 +191,5 @@ class TrackSteps(TrackSights):
         if self._keep_s:
             still = np.eye(SIZE)[:MOVING], np.zeros((MOVING, MOVING)), np.zeros(SIZE - MOVING)
             row, rates = estimate.state.row, estimate.rates_radps
-            first = Step(
-                estimate.t_s, row, row, estimate.covariance, *still, rates, estimate.light_s, 0, lit_m=estimate.lit_m
-            )
-            estimate.steps.append(first)
+            status = EstimateStatus(estimate.light_s, estimate.lit_m)
+            estimate.steps.append(Step(estimate.t_s, row, row, estimate.covariance, *still, rates, status))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
@@ -48,14 +48,26 @@ class Look:
     residuals: Residuals | None = None
 
 
+class EstimateStatus(NamedTuple):
+    """What rows tell of an estimate at one time, beside its state.
+
+    light_s: when a light was last used; lit_m: the range then, inf where none has been used. lights: how many the last
+    trigger's pictures told. north_doubt: the variance, rad^2, that north has beside the covariance.
+    """
+
+    light_s: float
+    lit_m: float = math.inf
+    lights: int = 0
+    north_doubt: float = 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class Step:
     """One step of a track as the smoother needs it.
 
     before: predicted; after, covariance: with what was seen at t_s. Both are a state's row (ROW,), or the error (SIZE,)
     against the path that a pass is linear about. F (MOVING, SIZE), Q (MOVING, MOVING), walk: how it came here from the
-    step before. rates_radps (2, 3). lights: how many the last trigger's pictures told. north_doubt: as of the estimate.
-    lit_m: the range at the last light, at light_s, inf where none has been.
+    step before. rates_radps (2, 3). status: as the estimate was after it.
     """
 
     t_s: float
@@ -66,11 +78,8 @@ class Step:
     Q: Floats
     walk: Floats
     rates_radps: Floats
-    light_s: float
-    lights: int
-    north_doubt: float = 0.0
+    status: EstimateStatus
     looks: tuple[Look, ...] = ()
-    lit_m: float = math.inf
 
 
 # So many steps are packed at once.
@@ -108,7 +117,7 @@ def _packed(steps: list[Step]) -> _Pack:
 
 
 def _row_of(step: Step) -> Floats:
-    numbers = np.array((step.t_s, step.light_s, step.lights, step.north_doubt, step.lit_m))
+    numbers = np.array((step.t_s, *step.status))
     halves = step.covariance[_UPPER], step.Q[_MOVING_UPPER]
     matrices = step.rates_radps.ravel(), *halves, step.F.ravel()
     return np.concatenate((numbers, *matrices, step.walk, step.before, step.after))
@@ -116,14 +125,14 @@ def _row_of(step: Step) -> Floats:
 
 def _step_of(row: Floats, looks: tuple[Look, ...]) -> Step:
     parts = (row[start:end].reshape(shape) for start, end, shape in _PARTS)
-    t_s, light_s, lights, doubt, lit_m, rates, half, of_Q, F, walk = parts
+    t_s, light_s, lit_m, lights, doubt, rates, half, of_Q, F, walk = parts
     covariance = np.empty((SIZE, SIZE))
     covariance[_UPPER] = covariance.T[_UPPER] = half
     Q = np.empty((MOVING, MOVING))
     Q[_MOVING_UPPER] = Q.T[_MOVING_UPPER] = of_Q
     before, after = row[_ENDS[-1] :].reshape(2, -1)
-    told = float(light_s), int(lights), float(doubt)
-    return Step(float(t_s), before, after, covariance, F, Q, walk, rates, *told, looks, float(lit_m))
+    status = EstimateStatus(float(light_s), float(lit_m), int(lights), float(doubt))
+    return Step(float(t_s), before, after, covariance, F, Q, walk, rates, status, looks)
 
 
 class Trail:

@@ -10,7 +10,7 @@ from buddyline.solver_service.track.guessing import LEAST, MOST, NEAR, GuessedMo
 from buddyline.solver_service.track.moving import TrackMoves
 from buddyline.solver_service.track.smoother import Path, smoothed
 from buddyline.solver_service.track.state import MOVING, SIZE, V_, State
-from buddyline.solver_service.track.trail import Look, Step, Trail
+from buddyline.solver_service.track.trail import EstimateStatus, Look, Step, Trail
 from buddyline.solver_service.track.walking import FIRST, Walking
 
 from tests.solver_service.track.dives import Setting, make
@@ -35,7 +35,17 @@ def filtered(seen: Floats, walk: float, noise: float) -> Trail:
         state = state.moved(state.r_m, state.v_mps + gain * (v - state.v_mps), state.R)
         P[V_, V_] *= 1.0 - gain
         steps.append(
-            Step(k * STEP_S, before.row, state.row, P, F, Q, np.zeros(SIZE - MOVING), np.zeros((2, 3)), 0.0, 0)
+            Step(
+                k * STEP_S,
+                before.row,
+                state.row,
+                P,
+                F,
+                Q,
+                np.zeros(SIZE - MOVING),
+                np.zeros((2, 3)),
+                EstimateStatus(0.0),
+            )
         )
     return steps
 
@@ -76,18 +86,15 @@ def path_of(
     count, nothing = len(auxiliary), np.zeros(0)
     return Path(
         t_s=STEP_S * np.arange(count),
-        light_s=nothing,
-        lights=np.zeros(0, np.int64),
-        north_doubt=nothing,
         rates_radps=nothing,
         states=nothing,
         halves=nothing,
         drawn=nothing,
         without=np.tile(without, (count, 1)),
+        statuses=[],
         looks=[(looks or {}).get(k, LIT) for k in range(count)],
         oldest=nothing,
         auxiliary=auxiliary,
-        lit_m=nothing,
     )
 
 

@@ -28,6 +28,7 @@ from buddyline.solver_service.track.state import (
     plain_of_invariant,
 )
 from buddyline.solver_service.track.strapdown import Increments, SampleGrid, integrate, propagate
+from buddyline.solver_service.track.trail import EstimateStatus
 from numpy.typing import NDArray
 
 STEP = 1e-6
@@ -229,7 +230,7 @@ def test_a_rows_covariance_holds_how_the_arc_is_bent() -> None:
     P = np.zeros((len(COLUMNS), len(COLUMNS)))
     P[:NAV, :NAV] = np.diag(sigma**2)
     batch = State(state.row[None])
-    told = rows_of((0,), batch, P[None], still[None], np.array((2,)), np.zeros(1), np.zeros(1), np.full(1, np.inf))[0]
+    told = rows_of((0,), (0.0,), batch, P[None], still[None], (EstimateStatus(0.0),))[0]
     assert told is not None
     error = np.zeros((4000, SIZE))
     error[:, :NAV] = np.random.default_rng(5).normal(0.0, 1.0, (4000, NAV)) * sigma

@@ -21,7 +21,7 @@ def steps_of() -> list[Step]:
 
 def numbers(step: Step) -> np.ndarray:  # type: ignore[type-arg]
     parts = step.F, step.walk, step.rates_radps, step.before, step.after
-    return np.concatenate([np.array((step.t_s, step.light_s, step.lights)), *map(np.ravel, parts)])
+    return np.concatenate([np.array((step.t_s, *step.status)), *map(np.ravel, parts)])
 
 
 def test_packed_steps_come_back() -> None:
