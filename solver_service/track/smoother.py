@@ -108,11 +108,10 @@ class Path:
         steps = np.arange(len(self))
         after, so_far = np.searchsorted(lit, steps), np.searchsorted(lit, steps, side="right")
         # The last light may be older than the path.
-        lit_m = np.array([status.lit_m for status in self.statuses])
-        light_s = np.array([status.light_s for status in self.statuses])
-        older_s = np.where(np.isfinite(lit_m), self.t_s - light_s, math.inf)
+        older = self.statuses[0]
+        older_s = self.t_s - older.light_s if math.isfinite(older.lit_m) else math.inf
         since_s = np.where(so_far, self.t_s - times_s[so_far - 1], older_s)
-        before_m = np.where(so_far, ranges_m[so_far - 1], lit_m)
+        before_m = np.where(so_far, ranges_m[so_far - 1], older.lit_m)
         nearest_m: Floats = np.where(since_s <= times_s[after] - self.t_s, before_m, ranges_m[after])
         return nearest_m
 
