@@ -90,21 +90,21 @@ class Smoothed:
     problems: list[str]
     dark: list[tuple[int, int, float]] = field(default_factory=list)
 
+    @classmethod
+    def none(cls, clock_ns: int, problems: list[str]) -> Smoothed:
+        """Give no track. clock_ns: how far B's clock was believed ahead."""
+        return cls([], clock_ns * 1e-9, math.inf, problems)
 
-def smooth(
-    records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int], clock_ns: int = 0, *, again: bool = True
-) -> Smoothed:
+
+def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]) -> Smoothed:
     """Give the whole dive's track at outputs_ns.
-
-    clock_ns: how far B's clock is believed ahead. again: whether to begin once more where the later passes contradict
-    the first one: with the offset that they found, which is nearer than that of the first.
 
     Where the pictures of both nodes tell different distances, their bars are taken for longer and shorter by half of
     that each, and the sigmas hold that one of them alone may be wrong.
     """
-    a, b = until_one_ended((in_order(records[0]), in_order(records[1])), clock_ns)
+    a, b = until_one_ended((in_order(records[0]), in_order(records[1])))
     records, fixes, gap = (judged(parted(a)), judged(parted(b))), sorted(fixes, key=stamp_of), 0.0
-    first = _first_pass(records, fixes, clock_ns)
+    first = _first_pass(records, fixes, 0)
     for _ in range(GAP_ROUNDS - 1):
         more = first.gap_beyond(gap)
         if not more:
@@ -117,8 +117,8 @@ def smooth(
             for record, share in zip(records, (-0.5 * more, 0.5 * more), strict=True)
         )
         records = a, b
-        first = _first_pass(records, fixes, clock_ns)
-    found = _of_first_pass(first, records, fixes, outputs_ns, clock_ns, gap, again=again)
+        first = _first_pass(records, fixes, 0)
+    found = _of_first_pass(first, records, fixes, outputs_ns, 0, gap, again=True)
     names = [record.node.name for record in records]
     return replace(found, problems=[*found.problems, gap_words(gap, names)]) if gap else found
 
@@ -170,14 +170,14 @@ def _of_first_pass(
     """
     first, parts, clock_ns = passed.track, passed.parts, passed.clock_ns
     if not parts:
-        return Smoothed([], clock_ns * 1e-9, math.inf, first.problems)
+        return Smoothed.none(clock_ns, first.problems)
     parts = of_one_clock(parts)
     without = any(map(mostly_without, parts))
     off_s = (clock_ns - told_ns) * 1e-9
     far = in_pieces(parts) or clock_off_by(parts[-1], MOST_LEFT_S)
     if far or (without and abs(off_s) > FAR_WITHOUT_S):
         said = f"{first.both}: {why_none(off_s)}: no track"
-        return Smoothed([], clock_ns * 1e-9, math.inf, [*first.problems, said])
+        return Smoothed.none(clock_ns, [*first.problems, said])
     if without:
         # Without a gyro the offset cannot be told from the turning, and is taken as it was told. The first pass has
         # shown that it is small. Its steps only take memory now.
@@ -224,7 +224,7 @@ def _of_first_pass(
         other = _of_first_pass(passed, records, fixes, outputs_ns, contradicting_ns, gap, again=False)
         return other if math.isfinite(other.clock_sigma_s) else replace(other, problems=[*other.problems, *lost])
     if not found:
-        return Smoothed([], clock_ns * 1e-9, math.inf, [*first.problems, *lost])
+        return Smoothed.none(clock_ns, [*first.problems, *lost])
     whole = _rows_of(found, outputs_ns, gap)
     return replace(whole, problems=[*whole.problems, *lost])
 
@@ -279,7 +279,7 @@ def _of_one_lamp_each(known: PassedOver, part: Estimate, outputs_ns: Sequence[in
     if found is None:
         names = " and ".join(record.node.name for record in known.records)
         said = f"nodes {names}: one lamp of each does not tell a track"
-        return Smoothed([], known.clock_ns * 1e-9, math.inf, [said])
+        return Smoothed.none(known.clock_ns, [said])
     track, path = found
     earlier = _path_before(known, path, -math.inf)
     if earlier is not None:
@@ -365,7 +365,7 @@ def _of_guessed_motion(
         again = settled(path, part.detection, part.shaking, known, sum(part.told_by), doubtful=False)
         found.append(again or (first, path))
     if not found:
-        return Smoothed([], first.clock_ns * 1e-9, math.inf, first.problems)
+        return Smoothed.none(first.clock_ns, first.problems)
     whole = _rows_of(found, outputs_ns, gap)
     problems = list(dict.fromkeys([*first.problems, *whole.problems]))
     return replace(whole, problems=problems, dark=first.lamps.dark())

@@ -107,17 +107,10 @@ def in_order(record: NodeRecord) -> NodeRecord:
     )
 
 
-def until_one_ended(records: Records, clock_ns: int) -> Records:
-    """Give what was recorded until the first of the two nodes ended: its lamps alone show no track after that.
-
-    clock_ns: how far B's clock is ahead.
-    """
-    shifts_ns = 0, clock_ns
-    ends_ns = [_end_ns(record) - shift_ns for record, shift_ns in zip(records, shifts_ns, strict=True)]
-    a, b = (
-        record.between(BEGINNING_NS, min(ends_ns) + shift_ns + 1)
-        for record, shift_ns in zip(records, shifts_ns, strict=True)
-    )
+def until_one_ended(records: Records) -> Records:
+    """Give what was recorded until the first of the two nodes ended: its lamps alone show no track after that."""
+    end_ns = min(map(_end_ns, records))
+    a, b = (record.between(BEGINNING_NS, end_ns + 1) for record in records)
     return a, b
 
 
