@@ -166,7 +166,8 @@ def _of_first_pass(
 ) -> Smoothed:
     """Give the track of a dive that a filter has passed over.
 
-    told_ns: how far B's clock was told to be ahead. gap: what the bars have been changed by.
+    told_ns: how far B's clock was told to be ahead. gap: what the bars have been changed by. again: whether to begin
+    once more where the later passes contradict the first one: with their offset, which is nearer than the first one's.
     """
     first, parts, clock_ns = passed.track, passed.parts, passed.clock_ns
     if not parts:
@@ -197,28 +198,14 @@ def _of_first_pass(
     lost: list[str] = []
     since_s, contradicting_ns = -math.inf, None
     for part in parts:
-        path, shaking = smoothed(part.steps, uses_up=True), part.shaking.less(shares)
-        earlier = _path_before(known, path, since_s)
+        one, other_ns = _settled_part(part, known, learned, since_s, only=len(parts) == 1)
         since_s = part.end_s
-        # Where the dive's beginning, before the first start, leads the passes astray, it is left out.
-        tries = [path] if earlier is None else [path.after(earlier), path]
-        late = len(parts) == 1 and part.searched and not part.agreed and path.t_s[0] - tries[0].t_s[0] > LATE_S
-        believed = part.detection, shaking, known if late else learned, sum(part.told_by)
-        alone = settled(path, *believed, doubtful=True) if late else None
-        for about in tries:
-            one = alone if late and about is path else settled(about, *believed, doubtful=late)
-            limit_s = MOST_LEFT_S if about is path else NEAR_CLOCK_S
-            if one is None or (alone is not None and _contradict(one[1], alone[1])):
-                continue
-            passed_s, first_s = _clock_s(*one), clock_ns * 1e-9 + part.state.clock_s
-            # What a late start tells of the clocks is little, and less than it believes.
-            if late or abs(passed_s - first_s) < max(limit_s, TOLD_SIGMAS * clock_sigma_s(one[1])):
-                found.append(one)
-                break
-            contradicting_ns = round(passed_s * 1e9)
+        if one is not None:
+            found.append(one)
         else:
             span = f"no track for {lasted_s(part):.0f} s"
             lost.append(f"{first.both}: passes over the dive contradict the first one or do not settle: {span}")
+            contradicting_ns = contradicting_ns if other_ns is None else other_ns
     if not found and again and contradicting_ns is not None:
         passed = _first_pass(records, fixes, contradicting_ns)
         other = _of_first_pass(passed, records, fixes, outputs_ns, contradicting_ns, gap, again=False)
@@ -227,6 +214,35 @@ def _of_first_pass(
         return Smoothed.none(clock_ns, [*first.problems, *lost])
     whole = _rows_of(found, outputs_ns, gap)
     return replace(whole, problems=[*whole.problems, *lost])
+
+
+def _settled_part(
+    part: Estimate, known: PassedOver, learned: PassedOver, since_s: float, *, only: bool
+) -> tuple[tuple[PathPass, Path] | None, int | None]:
+    """Pass over a track of the first pass until it settles; give the last pass, and its path.
+
+    The dive's beginning before the track's start, from since_s on, is passed over with it; where that leads the passes
+    astray, it is left out. learned: known, with what the first pass has learned of walks. only: whether the dive has no
+    other track. Where later passes find another offset of the clocks, there is none, but the offset, ns.
+    """
+    path, shaking = smoothed(part.steps, uses_up=True), part.shaking.less(known.shares)
+    earlier = _path_before(known, path, since_s)
+    tries = [path] if earlier is None else [path.after(earlier), path]
+    late = only and part.searched and not part.agreed and path.t_s[0] - tries[0].t_s[0] > LATE_S
+    believed = part.detection, shaking, known if late else learned, sum(part.told_by)
+    alone = settled(path, *believed, doubtful=True) if late else None
+    other_ns = None
+    for about in tries:
+        one = alone if late and about is path else settled(about, *believed, doubtful=late)
+        limit_s = MOST_LEFT_S if about is path else NEAR_CLOCK_S
+        if one is None or (alone is not None and _contradict(one[1], alone[1])):
+            continue
+        passed_s, first_s = _clock_s(*one), known.clock_ns * 1e-9 + part.state.clock_s
+        # What a late start tells of the clocks is little, and less than it believes.
+        if late or abs(passed_s - first_s) < max(limit_s, TOLD_SIGMAS * clock_sigma_s(one[1])):
+            return one, None
+        other_ns = round(passed_s * 1e9)
+    return None, other_ns
 
 
 def _contradict(path: Path, alone: Path) -> bool:
