@@ -14,6 +14,7 @@ from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, skew
+from buddyline.solver_service.track.moving import HOLD_S
 from buddyline.solver_service.track.samples import Samples
 from buddyline.solver_service.track.strapdown import OWN, Carried, Increments, NodesCarried, SampleGrid, integrate
 from numpy.typing import NDArray
@@ -84,13 +85,10 @@ class ToldSteps:
     grid: SampleGrid
 
 
-def told_steps(of_nodes: Sequence[Samples], delays_s: Floats, times_s: Floats, hold_s: float) -> ToldSteps:
-    """Give the samples between times (M + 1,), which each unit's stamps exceed by its delay.
-
-    hold_s: samples so long after a step's end count for it.
-    """
+def told_steps(of_nodes: Sequence[Samples], delays_s: Floats, times_s: Floats) -> ToldSteps:
+    """Give the samples between times (M + 1,), which each unit's stamps exceed by its delay (2,)."""
     seen = [
-        samples.steps(times_s + delay_s, hold_s - delay_s)
+        samples.steps(times_s + delay_s, HOLD_S - delay_s)
         for samples, delay_s in zip(of_nodes, delays_s.tolist(), strict=True)
     ]
     told = np.flatnonzero(np.logical_and.reduce([of_node.told for of_node in seen]))
@@ -113,14 +111,13 @@ def told_steps(of_nodes: Sequence[Samples], delays_s: Floats, times_s: Floats, h
 
 
 def steps_ahead(
-    of_nodes: Sequence[Samples], state: Carried, times_s: Sequence[float], hold_s: float, *, by_shares: bool
+    of_nodes: Sequence[Samples], state: Carried, times_s: Sequence[float], *, by_shares: bool
 ) -> StepsAhead:
     """Integrate both nodes' samples between times (M + 1,), but for steps that samples do not tell throughout.
 
-    hold_s: samples so long after a step's end count for it. by_shares: whether to tell what shares of the samples'
-    fast parts do.
+    by_shares: whether to tell what shares of the samples' fast parts do.
     """
-    steps = told_steps(of_nodes, state.delay_s, np.array(times_s), hold_s)
+    steps = told_steps(of_nodes, state.delay_s, np.array(times_s))
     told, values, grid = steps.told, steps.values, steps.grid if by_shares else replace(steps.grid, fast=None)
     count, most = grid.times_s.shape
     each = values.reshape(count, most, 13)

@@ -195,7 +195,7 @@ class PathPass(TrackSteps):
         if last == first:
             return {}
         times_s, delays_s = path.t_s[first : last + 1], path.state(first).delay_s
-        steps = told_steps(self.samples, delays_s, times_s, HOLD_S)
+        steps = told_steps(self.samples, delays_s, times_s)
         if not len(steps.told):
             return {}
         at = first + steps.told

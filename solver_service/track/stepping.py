@@ -114,7 +114,7 @@ class TrackSteps(TrackSights):
             # Where the constants move, or other steps come than were expected, fewer are integrated together.
             used_up = ahead is not None and not ahead.at
             self._together = min(2 * self._together, MOST_TOGETHER) if used_up else max(self._together // 2, 1)
-            ahead = steps_ahead(self.samples, estimate.state, self._coming(step), HOLD_S, by_shares=by_shares)
+            ahead = steps_ahead(self.samples, estimate.state, self._coming(step), by_shares=by_shares)
             self._ahead = ahead if step in ahead.at else None
         at = ahead.at.pop(step, None)
         return super().increments(estimate, t_s) if at is None else ahead.increments(estimate.state, at)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.ahead import TOLERANCES, steps_ahead
-from buddyline.solver_service.track.moving import HOLD_S, increments
+from buddyline.solver_service.track.moving import increments
 from buddyline.solver_service.track.samples import Samples
 from buddyline.solver_service.track.state import State
 from buddyline.solver_service.track.strapdown import Increments
@@ -36,7 +36,7 @@ def apart(one: Increments, other: Increments) -> dict[str, float]:
 
 
 def of_step(samples: list[Samples], about: State, state: State, k: int) -> tuple[Increments, Increments]:
-    ahead = steps_ahead(samples, about, TIMES_S, HOLD_S, by_shares=True)
+    ahead = steps_ahead(samples, about, TIMES_S, by_shares=True)
     start_s, end_s = TIMES_S[k : k + 2]
     together = ahead.increments(state, ahead.at[start_s, end_s])
     return together, increments(samples, state, start_s, end_s, by_shares=True)
@@ -71,9 +71,9 @@ def test_constants_that_changed_since_are_made_good(k: int) -> None:
 def test_a_step_that_samples_do_not_tell_is_left_out() -> None:
     rng = np.random.default_rng(1)
     state = a_state(1).with_parts(delay_s=DELAYS_S)
-    ahead = steps_ahead([shaken(rng), shaken(rng, hole=True)], state, TIMES_S, HOLD_S, by_shares=False)
+    ahead = steps_ahead([shaken(rng), shaken(rng, hole=True)], state, TIMES_S, by_shares=False)
     assert sorted(ahead.at) == [(1.0, 1.103), (1.103, 1.2), (1.3004, 1.35)]
-    past = steps_ahead([shaken(rng), shaken(rng)], state, (0.0, 0.1, 1.9, 2.0), HOLD_S, by_shares=False)
+    past = steps_ahead([shaken(rng), shaken(rng)], state, (0.0, 0.1, 1.9, 2.0), by_shares=False)
     assert sorted(past.at) == [(0.1, 1.9)]
 
 
