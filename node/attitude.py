@@ -54,8 +54,6 @@ MOVING_TILT_SIGMA_RAD: Final = math.radians(6.0)
 
 Triple = tuple[float, float, float]
 
-R_NED_ENU: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-
 
 @dataclass(frozen=True, slots=True)
 class AttitudeEstimate:

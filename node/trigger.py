@@ -95,7 +95,6 @@ class PhaseLock:
     ) -> None:
         self.residual_ns: int | None = None
         self._trigger_period_ns = trigger_period_ns
-        self._frames_per_trigger = frames
         self._period_ns = trigger_period_ns / frames
         self._min_ns = min_frame_ns
         self._line_ns = line_ns

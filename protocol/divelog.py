@@ -432,8 +432,6 @@ class DiveLogReader:
         self.close()
 
 
-def read_logs(
-    readers: Iterable[DiveLogReader], wanted: Callable[[str], bool] | None = None, since_ns: int | None = None
-) -> Iterator[Record]:
-    """Yield the records of several logs, merged by log time, from since_ns on."""
-    return heapq.merge(*(reader.records(wanted, since_ns) for reader in readers), key=lambda record: record.log_time_ns)
+def read_logs(readers: Iterable[DiveLogReader], wanted: Callable[[str], bool] | None = None) -> Iterator[Record]:
+    """Yield the records of several logs, merged by log time."""
+    return heapq.merge(*(reader.records(wanted) for reader in readers), key=lambda record: record.log_time_ns)

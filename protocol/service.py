@@ -185,6 +185,6 @@ def waited_for_processor_s() -> dict[str, float]:
     return found
 
 
-def start_logging(verbose: bool = False) -> None:
+def start_logging() -> None:
     """Send log messages to stderr, for journald and for people: level and text."""
-    logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, format="%(levelname).1s %(message)s")
+    logging.basicConfig(level=logging.INFO, format="%(levelname).1s %(message)s")

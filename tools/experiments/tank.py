@@ -16,7 +16,6 @@ from buddyline.tools.tags.detection import TagFinder
 from buddyline.tools.tags.layout import Layout
 from buddyline.tools.tags.pose import TagPose, readings_of, tag_pose
 
-VIDEO: Final = "test_vid.mp4"
 CAMERA: Final = CameraModel(
     model="pinhole", fx_px=1127.7, fy_px=1139.3, cx_px=314.7352, cy_px=226.3186, distortion=[0.0] * 5
 )
