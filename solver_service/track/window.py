@@ -6,8 +6,9 @@ What is unknown stands in `Fit`; the equations are in docs/track.md, "One lamp e
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Final, TypeAlias
 
 import numpy as np
@@ -43,6 +44,8 @@ OWN: Final = (slice(12, 27), slice(27, 42))
 DEPTH, CLOCK, PARAMETERS = 42, 43, 44
 Seen: TypeAlias = tuple[NDArray[np.intp], NDArray[np.intp]]
 """Of each node's pictures the lights (N, 3) that are used: picture, candidate, light."""
+Term: TypeAlias = tuple[Floats, Floats, float]
+"""What some measurements add to a fit's normal equations: whitened rows (M, PARAMETERS), residuals (M,), and cost."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +95,18 @@ class Window:
         held_m: the depth that all lights are taken to have; 0: their own.
         """
         N, g, cost = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS), 0.0
+        terms = chain(self._of_lights(seen, x, held_m), (self._of_depths(x),), self._of_attitudes(x))
+        for rows, y, its_cost in terms:
+            N += rows.T @ rows
+            g += rows.T @ y
+            cost += its_cost
+        prior = x.values()
+        N += np.diag(_PRIOR)
+        g -= _PRIOR * prior
+        cost += float(_PRIOR @ (prior * prior))
+        return N, g, cost
+
+    def _of_lights(self, seen: Seen, x: Fit, held_m: float) -> Iterator[Term]:
         for observer in (0, 1):
             n, _, light = seen[observer].T
             picked = [(self.sights[observer][i], k) for i, k, _ in seen[observer].tolist()]
@@ -109,44 +124,32 @@ class Window:
             var = sigma**2 + SHAKEN_PX**2
             chi2 = (h * h).sum(1) / var
             w = 1.0 / (1.0 + chi2 / HEAVY) if not held_m else np.ones(len(n))
-            cost += float((HEAVY * np.log1p(chi2 / HEAVY)).sum() if not held_m else chi2.sum())
+            cost = float((HEAVY * np.log1p(chi2 / HEAVY)).sum() if not held_m else chi2.sum())
             root = np.sqrt(w / var)[:, None]
-            rows = (H * root[..., None]).reshape(-1, PARAMETERS)
-            N += rows.T @ rows
-            g -= rows.T @ (h * root).ravel()
-        an = self.anchors
-        c = self.courses
-        r, dr = self.apart(an.depth_at, x)
-        ports = [node.rig.depth_port_m for node in self.nodes]
-        shown = r[:, 2] + x.depth_m
-        row = dr[:, 2].copy()
+            yield (H * root[..., None]).reshape(-1, PARAMETERS), -(h * root).ravel(), cost
+
+    def _of_depths(self, x: Fit) -> Term:
+        at, sigma_m = self.anchors.depth_at, self.anchors.depth_sigma_m
+        r, dr = self.apart(at, x)
+        shown_m, rows = r[:, 2] + x.depth_m, dr[:, 2].copy()
         for node, sign in ((0, -1.0), (1, 1.0)):
-            R = x.R[node] @ c[node].D[an.depth_at]
-            arm = R @ ports[node]
-            shown = shown + sign * arm[:, 2]
-            row[:, PHI[node]] -= sign * skew(arm)[:, 2]
-        row[:, DEPTH] += 1.0
-        y = (an.depth_m - shown) / an.depth_sigma_m
-        row = row / an.depth_sigma_m[:, None]
-        N += row.T @ row
-        g += row.T @ y
-        cost += float(y @ y)
-        for node in (0, 1):
-            at = an.attitude_at[node]
+            arm = x.R[node] @ self.courses[node].D[at] @ self.nodes[node].rig.depth_port_m
+            shown_m = shown_m + sign * arm[:, 2]
+            rows[:, PHI[node]] -= sign * skew(arm)[:, 2]
+        rows[:, DEPTH] += 1.0
+        y = (self.anchors.depth_m - shown_m) / sigma_m
+        return rows / sigma_m[:, None], y, float(y @ y)
+
+    def _of_attitudes(self, x: Fit) -> Iterator[Term]:
+        for node, (at, told, root) in enumerate(
+            zip(self.anchors.attitude_at, self.anchors.R, self.anchors.root, strict=True)
+        ):
             R = self.turned(node, at, x)
-            y3 = rotation_log(an.R[node] @ np.swapaxes(R, 1, 2))
             H = np.zeros((len(at), 3, PARAMETERS))
             H[:, :, PHI[node]] = np.eye(3)
-            H[:, :, OWN[node]] = R @ c[node].G[at]
-            rows, gap = (an.root[node] @ H).reshape(-1, PARAMETERS), (an.root[node] @ y3[..., None]).ravel()
-            N += rows.T @ rows
-            g += rows.T @ gap
-            cost += float(gap @ gap)
-        prior = x.values()
-        N += np.diag(_PRIOR)
-        g -= _PRIOR * prior
-        cost += float(_PRIOR @ (prior * prior))
-        return N, g, cost
+            H[:, :, OWN[node]] = R @ self.courses[node].G[at]
+            y = (root @ rotation_log(told @ np.swapaxes(R, 1, 2))[..., None]).ravel()
+            yield (root @ H).reshape(-1, PARAMETERS), y, float(y @ y)
 
     def apart(self, n: NDArray[np.intp], x: Fit) -> tuple[Floats, Floats]:
         """Give r (N, 3) at times n, and its Jacobian."""
