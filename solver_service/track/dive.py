@@ -375,7 +375,7 @@ def _of_guessed_motion(
             part.walking,
             guessed=guessed,
             clock_sigma_s=CLOCK_WITHOUT_S,
-            fixes=[(first.between(fix.stamp_ns), fix) for fix in fixes],
+            fixes=[(first.pair_seconds(fix.stamp_ns), fix) for fix in fixes],
             lasting=_lasting([part]),
         )
         again = settled(path, part.detection, part.shaking, known, sum(part.told_by), doubtful=False)
@@ -392,7 +392,8 @@ def _rows_of(passed: Sequence[tuple[TrackFilter | PathPass, Path]], outputs_ns: 
     problems = list(dict.fromkeys(said for track, _ in passed for said in track.problems))
     stamps = sorted(outputs_ns)
     rows = chain.from_iterable(
-        rows_between(path, np.array([track.between(stamp) for stamp in stamps]), stamps, gap) for track, path in passed
+        rows_between(path, np.array([track.pair_seconds(stamp) for stamp in stamps]), stamps, gap)
+        for track, path in passed
     )
     last, path = passed[-1]
     return Smoothed(rows, _clock_s(last, path), clock_sigma_s(path), problems, last.lamps.dark())

@@ -84,6 +84,8 @@ FAR_SIGMAS: Final = 6.0
 BRIDGED_S: Final = 1.0
 # The last row stands for the present where it is at most this much before it.
 LITTLE_S: Final = 0.01
+# Of one time, a row comes after the fixes (0) and the pictures of both nodes (1 and 2).
+ROW_RANK: Final = 3
 # Messages older than this are dropped. The noise of slow sensors is learned from so much.
 MEMORY_S: Final = 30.0
 
@@ -120,7 +122,7 @@ class TrackFilter(TrackPool):
         """Go on as `advance` does while rows are taken; give those that are still to be made."""
         end_s = self.seconds(0, to_ns) - HOLD_S
         for stamp_ns in outputs_ns or ():
-            self._push(self.between(stamp_ns), 3, stamp_ns)
+            self._push(self.pair_seconds(stamp_ns), ROW_RANK, stamp_ns)
         while self._events and self._events[0][0] <= end_s:
             t_s, _, _, what = heapq.heappop(self._events)
             if isinstance(what, int):

@@ -78,8 +78,8 @@ class TrackIntake:
         """Give the stamp of A's clock at a time since the epoch."""
         return (self.epoch_ns or 0) + round(t_s * 1e9)
 
-    def between(self, stamp_ns: int) -> float:
-        """Give a stamp between both clocks, as those of fixes and rows are, as `seconds` does."""
+    def pair_seconds(self, stamp_ns: int) -> float:
+        """Give a stamp midway between both clocks, as those of fixes and rows are, in the seconds of `seconds`."""
         return self.seconds(0, stamp_ns - self.clock_ns // 2)
 
     def add_imu(
@@ -135,14 +135,17 @@ class TrackIntake:
         """Take a pose that one trigger's lights gave by themselves; one out of numeric range is left out."""
         numbers = np.concatenate((fix.t_a_b_m.ravel(), fix.R_a_b.ravel(), fix.covariance.ravel()))
         if not np.isfinite(numbers).all() or np.abs(numbers).max() > BEYOND:
-            self._problems.report(f"{self.both}: fixes out of numeric range are left out", self.between(fix.stamp_ns))
+            self._problems.report(
+                f"{self.both}: fixes out of numeric range are left out", self.pair_seconds(fix.stamp_ns)
+            )
             return
-        self._push(self.between(fix.stamp_ns), 0, fix)
+        self._push(self.pair_seconds(fix.stamp_ns), 0, fix)
 
-    def _push(self, t_s: float, kind: int, what: Sight | FixSeen | int) -> None:
-        # The count keeps two of a kind at one time in their order: they cannot be compared.
+    def _push(self, t_s: float, rank: int, what: Sight | FixSeen | int) -> None:
+        """Have something taken at t_s. rank: the order at one time: fixes, then pictures by node, then asked rows."""
+        # The count keeps two of a rank at one time in their order: they cannot be compared.
         self._count += 1
-        heapq.heappush(self._events, (t_s, kind, self._count, what))
+        heapq.heappush(self._events, (t_s, rank, self._count, what))
 
     def _turning_of(self, node: int) -> Turning:
         return Turning(self.attitudes[node], self.nodes[node].rig.R_body_camera)

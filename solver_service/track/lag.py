@@ -43,12 +43,12 @@ class TrackLag:
         if main is None or not main.confirmed or len(main.steps) < 2 or not self._due or self._track.doubted():
             return []
         ready_s = main.t_s - lag_s
-        ready = [stamp for stamp in self._due if self._track.between(stamp) <= ready_s]
+        ready = [stamp for stamp in self._due if self._track.pair_seconds(stamp) <= ready_s]
         if not ready or ready_s - self._done_s < every_s:
             return []
         self._done_s = ready_s
         self._due = self._due[len(ready) :]
-        times_s = np.array([self._track.between(stamp) for stamp in ready])
+        times_s = np.array([self._track.pair_seconds(stamp) for stamp in ready])
         gap = main.scale.share if main.scale.found else 0.0
         rows = list(rows_between(smoothed(main.steps), times_s, ready, gap, main.by_scale[COLUMNS]))
         main.steps.drop_before(ready_s - EVERY_S)

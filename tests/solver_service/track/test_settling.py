@@ -78,7 +78,7 @@ def first_pass(dive: KnownDive) -> tuple[Path, Estimate, PassedOver]:
         part.walking,
         guessed=GuessedMotion.of(part.walking),
         clock_sigma_s=0.003,
-        fixes=[(first.between(fix.stamp_ns), fix) for fix in dive.fixes],
+        fixes=[(first.pair_seconds(fix.stamp_ns), fix) for fix in dive.fixes],
     )
     return smoothed(part.steps, auxiliary=True), part, known
 
