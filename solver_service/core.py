@@ -192,8 +192,8 @@ class SolverCore:
 
     def keep_up(self, behind_ns: int, receive_ns: int) -> None:
         """Take how long frames of now have waited for this core: in a crowd, leave out what there is no time for."""
-        tracks = [pair.tracker for _, pair in sorted(self.pairs.items()) if pair.tracker and pair.tracker.follows]
-        network = [self.network] if self.network is not None and self.network.follows else []
+        tracks = [pair.tracker for _, pair in sorted(self.pairs.items()) if pair.tracker and pair.tracker.has_estimate]
+        network = [self.network] if self.network is not None and self.network.has_estimate else []
         now_ns = self._steady(receive_ns) or 0
         self.pace.take(behind_ns if self.is_crowded else 0, now_ns, tracks or network)
 
@@ -264,7 +264,7 @@ class SolverCore:
         if settled:
             work_out_together([one.track for _, one in settled])
         for pair, one in settled:
-            messages += pair.told(one)
+            messages += pair.tell(one)
         if self.network is None:
             return messages
         self.network.one_in = self.pace.one_in

@@ -71,7 +71,7 @@ class NetTracker:
         self._stopped = False
 
     @property
-    def follows(self) -> bool:
+    def has_estimate(self) -> bool:
         """Whether there is an estimate."""
         return self._filter is not None
 
@@ -102,7 +102,7 @@ class NetTracker:
         """Go on to where these outcomes allow; return the poses of all nodes up to there."""
         outcomes, fixes = list(outcomes), []
         if not outcomes or self._stopped:
-            return self._told([])
+            return self._with_left([])
         for one in outcomes:
             # A late frame's stamp is old, or far from the dive's time: it does not carry the network on.
             if isinstance(one, RelativePose) or (isinstance(one, Rejected) and one.reason != "late"):
@@ -118,12 +118,12 @@ class NetTracker:
             except NUMERIC_ERRORS as error:
                 self._note([f"values were out of numeric range ({error}): the network started anew"])
                 self.forget()
-                return self._told([])
+                return self._with_left([])
 
     def finish(self) -> list[Message]:
         """Take what is left, at the end of the dive."""
         if self._filter is None:
-            return self._told([])
+            return self._with_left([])
         with np.errstate(all="ignore"):
             try:
                 messages = self._take([], max(self._settled_ns.values(), default=0) + S_NS)
@@ -131,7 +131,7 @@ class NetTracker:
             except NUMERIC_ERRORS as error:
                 self._note([f"values were out of numeric range ({error}): the network started anew"])
                 self.forget()
-                return self._told([])
+                return self._with_left([])
 
     def _rest(self, track: NetFilter) -> list[Message]:
         """Return what is still to be smoothed; nothing where absurd values have spoiled it."""
@@ -141,7 +141,7 @@ class NetTracker:
             except NUMERIC_ERRORS:
                 return []
 
-    def _told(self, messages: list[Message]) -> list[Message]:
+    def _with_left(self, messages: list[Message]) -> list[Message]:
         """Return messages, behind those of a network that has ended."""
         left, self._left = self._left, []
         return left + messages
@@ -158,20 +158,20 @@ class NetTracker:
     def _take(self, fixes: Sequence[RelativePose], to_ns: int) -> list[Message]:
         self._meet(to_ns)
         if self._filter is None:
-            return self._told([])
+            return self._with_left([])
         track = self._filter
         for fix in fixes:
             if fix.node_a in self._nodes and fix.node_b in self._nodes:
                 track.add_pair_fix(self._nodes.index(fix.node_a), self._nodes.index(fix.node_b), fix_of(fix))
         if to_ns <= self._taken_ns:
-            return self._told([])
+            return self._with_left([])
         for index, node in enumerate(self._nodes):
             self._feed(track, index, self._streams[node], self._taken_ns + 1, to_ns)
         told_ns = min(to_ns, max(self._settled_ns.values(), default=to_ns))
         due = range(-(-(self._told_ns + 1) // self._period_ns), told_ns // self._period_ns + 1)
         self._taken_ns, self._told_ns = to_ns, told_ns
         rows = track.advance(to_ns, [k * self._period_ns for k in due if not k % self.one_in])
-        return self._told([self._message(row) for row in rows])
+        return self._with_left([self._message(row) for row in rows])
 
     def _meet(self, to_ns: int) -> None:
         """Take nodes into the network whose calibration has come; start anew where one has changed."""

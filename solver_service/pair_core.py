@@ -120,7 +120,7 @@ class PairCore:
 
         told_ns: the track gets only later outcomes.
         """
-        return self.told(self.follow(told_ns))
+        return self.tell(self.follow(told_ns))
 
     def follow(self, told_ns: int = -1) -> Settled:
         """Settle, but for the track's messages, which may be worked out together with those of other pairs."""
@@ -131,9 +131,9 @@ class PairCore:
         track = self.tracker.follow(newer(settled, told_ns)) if self.tracker is not None else Coming()
         return Settled(settled, track)
 
-    def told(self, settled: Settled) -> list[Message]:
+    def tell(self, settled: Settled) -> list[Message]:
         """Return the outcomes, then the track's messages."""
-        told = settled.outcomes + (self.tracker.told(settled.track) if self.tracker is not None else [])
+        told = settled.outcomes + (self.tracker.tell(settled.track) if self.tracker is not None else [])
         for message in told:
             if isinstance(message, RelativePose):
                 self._posed_ns = message.stamp_ns

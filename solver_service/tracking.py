@@ -142,7 +142,7 @@ class PairTracker:
         self._unseen: dict[int, int] = {}
 
     @property
-    def follows(self) -> bool:
+    def has_estimate(self) -> bool:
         """Whether there is an estimate."""
         return self._filter is not None and (self._filter.main is not None or bool(self._filter.challengers))
 
@@ -218,7 +218,7 @@ class PairTracker:
 
     def take(self, outcomes: Sequence[Message]) -> list[Message]:
         """Go on to the newest of these outcomes; return the live tracks' messages up to there."""
-        return self.told(self.follow(outcomes))
+        return self.tell(self.follow(outcomes))
 
     def follow(self, outcomes: Sequence[Message]) -> Coming:
         """Go on as `take` does; return what there is to tell, which may be worked out together with other pairs'."""
@@ -229,11 +229,11 @@ class PairTracker:
                 self._start_anew(str(error))
                 return Coming()
 
-    def told(self, coming: Coming) -> list[Message]:
+    def tell(self, coming: Coming) -> list[Message]:
         """Return the messages of what there is to tell."""
         with np.errstate(all="ignore"):
             try:
-                return self._told(coming)
+                return self._tell(coming)
             except NUMERIC_ERRORS as error:
                 self._start_anew(str(error))
                 return list(coming.messages)
@@ -263,7 +263,7 @@ class PairTracker:
         elif (
             self.crowded
             and min(stamps_ns) - self._fixed_ns > REST_NS
-            and not (self.follows or "smooth" in self._settings.modes)
+            and not (self.has_estimate or "smooth" in self._settings.modes)
         ):
             self._idle = True
             return Coming()
@@ -334,7 +334,7 @@ class PairTracker:
             return []
         with np.errstate(all="ignore"):
             try:
-                messages = self._told(self._advance(end_ns))
+                messages = self._tell(self._advance(end_ns))
                 if self._lag is not None:
                     messages += self._messages(self._lag.finish(), "lag")
                 if not all(self._pieces):
@@ -412,7 +412,7 @@ class PairTracker:
             if stream.newest_ns is not None
         }
 
-    def _told(self, coming: Coming) -> list[Message]:
+    def _tell(self, coming: Coming) -> list[Message]:
         node_a, node_b = (stream.node for stream in self._streams)
         make_rows(coming.due)
         made = [(one.row if isinstance(one, DueRow) else one, mode) for one, mode in coming.rows]

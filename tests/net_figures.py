@@ -191,7 +191,7 @@ def solved(messages: Sequence[Message], mode: str, hz: float) -> NetRun:
         note(self.stamp_ns, [one.node for one in self.members], after, P)
         return after, own
 
-    silent = {"follow": lambda *_: Coming(), "told": lambda *_: [], "finish": lambda *_: []}
+    silent = {"follow": lambda *_: Coming(), "tell": lambda *_: [], "finish": lambda *_: []}
     with (
         patch.object(NetEstimate, "due_row", due_row),
         patch.object(Told, "smoothed", back),

@@ -69,7 +69,7 @@ def errors(world: World, poses: list[NodePose], origin: str | None = None) -> di
 def no_tracks_of_pairs() -> Iterator[None]:
     """The network uses none of them, and they take two thirds of the time."""
     with pytest.MonkeyPatch.context() as patch:
-        for name, told in (("follow", Coming()), ("told", []), ("finish", [])):
+        for name, told in (("follow", Coming()), ("tell", []), ("finish", [])):
             patch.setattr(PairTracker, name, lambda *_, told=told: told)
         yield
 
