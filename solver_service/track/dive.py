@@ -229,7 +229,7 @@ def _settled_part(
     earlier = _path_before(known, path, since_s)
     tries = [path] if earlier is None else [path.after(earlier), path]
     late = only and part.searched and not part.agreed and path.t_s[0] - tries[0].t_s[0] > LATE_S
-    believed = part.detection, shaking, known if late else learned, sum(part.told_by)
+    believed = part.detection, shaking, known if late else learned, sum(part.lit_pictures)
     alone = settled(path, *believed, doubtful=True) if late else None
     other_ns = None
     for about in tries:
@@ -270,15 +270,15 @@ def _unrest(parts: Sequence[Estimate]) -> float:
 
     Of lights whose errors last it does not: these do not show against a track that has the same errors.
     """
-    told = sum(part.told for part in parts)
+    told = sum(part.chi2_dof for part in parts)
     if told <= 100 or _lasting(parts):
         return 1.0
-    return min(max(math.sqrt(sum(part.surprise for part in parts) / told), 0.3), 2.0)
+    return min(max(math.sqrt(sum(part.chi2 for part in parts) / told), 0.3), 2.0)
 
 
 def _lasting(parts: Sequence[Estimate]) -> bool:
     """Whether the errors of most lights that were used last from picture to picture."""
-    return sum(part.lasted for part in parts) > 0.5 * sum(part.told for part in parts)
+    return sum(part.lasting_dof for part in parts) > 0.5 * sum(part.chi2_dof for part in parts)
 
 
 def _clock_s(track: TrackFilter | PathPass, path: Path) -> float:
@@ -288,10 +288,13 @@ def _clock_s(track: TrackFilter | PathPass, path: Path) -> float:
 
 def _of_one_lamp_each(known: PassedOver, part: Estimate, outputs_ns: Sequence[int], gap: float) -> Smoothed:
     """Give the track that began with one lamp of each node, the dive's beginning with it if that settles, too."""
-    path, told, shaking = smoothed(part.steps, uses_up=True), sum(part.told_by), part.shaking.less(known.shares)
+    path, believed = (
+        smoothed(part.steps, uses_up=True),
+        (part.shaking.less(known.shares), known, sum(part.lit_pictures)),
+    )
     # A reflection beside the lit lamp would pass for the dark one, and tell a range.
     lit = np.where(part.detection < NEVER_FOUND, 0.0, part.detection)
-    found = settled(path, lit, shaking, known, told, doubtful=True)
+    found = settled(path, lit, *believed, doubtful=True)
     if found is None:
         names = " and ".join(record.node.name for record in known.records)
         said = f"nodes {names}: one lamp of each does not tell a track"
@@ -299,7 +302,7 @@ def _of_one_lamp_each(known: PassedOver, part: Estimate, outputs_ns: Sequence[in
     track, path = found
     earlier = _path_before(known, path, -math.inf)
     if earlier is not None:
-        track, path = settled(path.after(earlier), track.passed.detection, shaking, known, told, doubtful=True) or found
+        track, path = settled(path.after(earlier), track.passed.detection, *believed, doubtful=True) or found
     return _rows_of([(track, path)], outputs_ns, gap)
 
 
@@ -378,7 +381,7 @@ def _of_guessed_motion(
             fixes=[(first.pair_seconds(fix.stamp_ns), fix) for fix in fixes],
             lasting=_lasting([part]),
         )
-        again = settled(path, part.detection, part.shaking, known, sum(part.told_by), doubtful=False)
+        again = settled(path, part.detection, part.shaking, known, sum(part.lit_pictures), doubtful=False)
         found.append(again or (first, path))
     if not found:
         return Smoothed.none(first.clock_ns, first.problems)

@@ -42,23 +42,24 @@ class Estimate:
     The lights: detection (2, 2): by observer and light, how often a light in the picture is found; shown (2, 2): how
     likely it was to be found at shown_s, by observer, after the last picture had told. last_seen (2,): the probability
     that each light is among the last picture's candidates, None where not both should be in it. lit_s (2, 2): when each
-    was last used. light_s: when any was, at first the start, which is made of lights; lit_m: the range then. trigger:
-    time, observer and light of those of the last trigger. pictures: how many it has taken since it is confirmed; bare:
-    of these, how many while a node had no inertial unit. bars: how many pictures showed both lights, bar_s: when one
-    last did; late_bars: how many did from REFLECTED_S after the start on. told_by: how many of each node showed any.
-    missed: in how many of each node's last pictures, on end, a light should be and none was used. looks_away: whether
-    each node's last picture has shown none, wherever they should be. unseen_by: a node that has shown no light yet.
+    was last used. light_s: when any was, at first the start, which is made of lights; lit_m: the range then.
+    trigger_lights: time, observer and light of those of the last trigger. pictures: how many it has taken since it is
+    confirmed; bare: of these, how many while a node had no inertial unit. lit_pictures: in how many of each node any
+    light was used. bars: how many pictures showed both lights, bar_s: when one last did; late_bars: how many did from
+    REFLECTED_S after the start on. missed: in how many of each node's last pictures, on end, a light should be and none
+    was used. looks_away: whether each node's last picture has shown none, wherever they should be. unseen_by: a node
+    that has shown no light yet.
 
     How well it fits: evidence: log odds over clutter; evidence_by: of each node's pictures. baseline: the main
-    estimate's at the start. surprise, told: chi^2 of the lights used, and of how many residuals; lasted: of how many
-    with errors that last. agreed_s: when a fix last agreed with it, inf where none did; agreed: how many did;
+    estimate's at the start. chi2: of the lights used; chi2_dof: of how many residuals; lasting_dof: of how many with
+    errors that last. agreed_s: when a fix last agreed with it, inf where none did; agreed: how many did;
     contradicted: how many since then did not; gap_chi2: the running mean of the fixes' chi^2.
 
     Its life: searched: it started without a fix; lone: from single lamps. skip_s: pictures within this after start_s
     made it, or a fix that it took in their place, and tell nothing new. patience_s: how long it may stay unconfirmed.
-    end_s: later pictures are not its own. course: the evidence over time, used: the lights of each picture, by node
-    and stamp; both while it is not confirmed. given: the lights to use where that is decided. saw: node of the lamps,
-    time and last_seen of each picture while it is not confirmed.
+    end_s: later pictures are not its own. While it is not confirmed, of each picture: evidence_history: its time and
+    the evidence then; used: its lights, by node and stamp; seen_history: node of the lamps, time and last_seen. given:
+    the lights to use where that is decided.
     """
 
     t_s: float
@@ -75,7 +76,7 @@ class Estimate:
     lit_s: Floats = field(default_factory=lambda: np.full((2, 2), -np.inf))
     light_s: float = -np.inf
     lit_m: float = math.nan
-    trigger: list[tuple[float, int, int]] = field(default_factory=list)
+    trigger_lights: list[tuple[float, int, int]] = field(default_factory=list)
     attitude_s: list[float] = field(default_factory=lambda: [-np.inf, -np.inf])
     depth_s: float = -np.inf
     compasses: list[tuple[float, float]] = field(default_factory=lambda: [(0.0, np.inf), (0.0, np.inf)])
@@ -89,9 +90,9 @@ class Estimate:
     learns: bool = True
     follows_walk: bool = False
     wide: bool = False
-    surprise: float = 0.0
-    told: int = 0
-    lasted: int = 0
+    chi2: float = 0.0
+    chi2_dof: int = 0
+    lasting_dof: int = 0
     end_s: float = np.inf
     skip_s: float = 0.02
     patience_s: float = CHALLENGE_S
@@ -104,7 +105,7 @@ class Estimate:
     bars: int = 0
     late_bars: int = 0
     bar_s: float = -np.inf
-    told_by: list[int] = field(default_factory=lambda: [0, 0])
+    lit_pictures: list[int] = field(default_factory=lambda: [0, 0])
     missed: list[int] = field(default_factory=lambda: [0, 0])
     without: list[bool] = field(default_factory=lambda: [False, False])
     by_shares: Floats = field(default_factory=lambda: np.zeros((SIZE, SHARES)))
@@ -118,9 +119,9 @@ class Estimate:
     gap_chi2: float = 0.0
     used: dict[tuple[int, int], Chosen] = field(default_factory=dict)
     given: dict[tuple[int, int], Chosen] = field(default_factory=dict)
-    course: list[tuple[float, float]] = field(default_factory=list)
+    evidence_history: list[tuple[float, float]] = field(default_factory=list)
     last_seen: Floats | None = None
-    saw: list[tuple[int, float, Floats]] = field(default_factory=list)
+    seen_history: list[tuple[int, float, Floats]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         """No light is older than the start."""
@@ -141,7 +142,7 @@ class Estimate:
     @property
     def lights(self) -> int:
         """Give how many lights the last trigger's pictures told."""
-        return len({(observer, light) for _, observer, light in self.trigger})
+        return len({(observer, light) for _, observer, light in self.trigger_lights})
 
     @property
     def status(self) -> EstimateStatus:
@@ -154,14 +155,14 @@ class Estimate:
             "evidence_by",
             "attitude_s",
             "compasses",
-            "told_by",
+            "lit_pictures",
             "missed",
             "looks_away",
             "without",
             "turning_off",
             "shown_s",
         )
-        lists = *of_nodes, "trigger", "course", "saw"
+        lists = *of_nodes, "trigger_lights", "evidence_history", "seen_history"
         own: dict[str, object] = {name: list(getattr(self, name)) for name in lists}
         own |= {"detection": self.detection.copy(), "shown": self.shown.copy(), "lit_s": self.lit_s.copy()}
         own |= {"steps": self.steps.copy(), "used": dict(self.used)}
@@ -169,8 +170,8 @@ class Estimate:
 
     def gained_since(self, t_s: float) -> float:
         """Give the evidence gained after t_s."""
-        at = bisect.bisect_right(self.course, t_s, key=_first)
-        return self.evidence - (self.course[at - 1][1] if at else 0.0)
+        at = bisect.bisect_right(self.evidence_history, t_s, key=_first)
+        return self.evidence - (self.evidence_history[at - 1][1] if at else 0.0)
 
 
 def lead(one: Estimate, other: Estimate) -> float:

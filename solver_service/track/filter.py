@@ -286,7 +286,7 @@ class TrackFilter(TrackPool):
     @staticmethod
     def _used_none(estimate: Estimate) -> bool:
         """Whether an unconfirmed estimate could use no light of its last two pictures."""
-        return sum(t_s > estimate.light_s for t_s, _ in estimate.course[-2:]) == 2
+        return sum(t_s > estimate.light_s for t_s, _ in estimate.evidence_history[-2:]) == 2
 
     def _take_as_measured(self, estimate: Estimate, t_s: float, fix: FixSeen) -> None:
         """Update a wide start by a fix. The lights of the fix's trigger are not used again.
@@ -388,7 +388,7 @@ class TrackFilter(TrackPool):
         self.main = self._again(estimate)
         self.main.confirmed = True
         # Others are replayed, which tells which lamps are dark.
-        for node, t_s, seen in estimate.saw if estimate.lone else ():
+        for node, t_s, seen in estimate.seen_history if estimate.lone else ():
             self.lamps.take(node, t_s, seen)
 
     @staticmethod
@@ -419,10 +419,10 @@ class TrackFilter(TrackPool):
         if estimate.lone:
             place = place_covariance(estimate.state, estimate.covariance)
             share = math.sqrt(np.trace(place)) / float(np.linalg.norm(estimate.state.r_m))
-            return min(estimate.told_by) >= TOLD and share < LONE_SHARE
+            return min(estimate.lit_pictures) >= TOLD and share < LONE_SHARE
         if estimate.searched:
-            return estimate.bars >= BARS and min(estimate.told_by) >= TOLD
-        return estimate.agreed >= fixes or min(estimate.bars, *estimate.told_by) >= bars
+            return estimate.bars >= BARS and min(estimate.lit_pictures) >= TOLD
+        return estimate.agreed >= fixes or min(estimate.bars, *estimate.lit_pictures) >= bars
 
     def _again(self, estimate: Estimate) -> Estimate:
         """Give an estimate as it is to be followed once confirmed: replayed, if it started without a fix."""

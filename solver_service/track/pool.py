@@ -105,8 +105,8 @@ class TrackPool(TrackSteps):
             state=again.state,
             covariance=again.covariance,
             shaking=again.shaking,
-            surprise=again.surprise,
-            told=again.told,
+            chi2=again.chi2,
+            chi2_dof=again.chi2_dof,
             lit_m=again.lit_m,
             steps=again.steps if keep_s else Trail(),
             attitude_s=again.attitude_s,
@@ -241,9 +241,9 @@ class TrackPool(TrackSteps):
     def _follow(self, estimate: Estimate, t_s: float, sight: Sight) -> None:
         """Bring an estimate that is not confirmed to a picture."""
         self._step(estimate, t_s, sight)
-        estimate.course.append((t_s, estimate.evidence))
+        estimate.evidence_history.append((t_s, estimate.evidence))
         if estimate.last_seen is not None:
-            estimate.saw.append((1 - sight.node, t_s, estimate.last_seen))
+            estimate.seen_history.append((1 - sight.node, t_s, estimate.last_seen))
 
     def _fork(self, estimate: Estimate, t_s: float, sight: Sight) -> None:
         """Follow each candidate of the node that has not yet told anything as each light, as estimates of their own."""

@@ -254,7 +254,7 @@ class PathPass(TrackSteps):
                 more.append(np.zeros(1))
                 doubts.append(np.zeros(1))
         for sight, by_path in seen:
-            main.trigger = [one for one in main.trigger if abs(sight.t_s - one[0]) < ONE_TRIGGER_S]
+            main.trigger_lights = [one for one in main.trigger_lights if abs(sight.t_s - one[0]) < ONE_TRIGGER_S]
             found = self._associated(sight, by_path)
             counts = found.chosen if self._keeps else counted(found.chosen, sight, main)
             residuals = None
@@ -268,8 +268,8 @@ class PathPass(TrackSteps):
                     residuals = Residuals(y, noise + np.diag(more[-1]), H[:, COLUMNS])
                 used = [(sight.t_s, sight.node, light) for _, light, _ in found.chosen]
                 lights += used
-                main.trigger += used
-                main.told_by[sight.node] += 1
+                main.trigger_lights += used
+                main.lit_pictures[sight.node] += 1
             looks.append(Look(sight.node, sight.stamp_ns, sight.t_s, counts, residuals))
         if rows:
             H, y, noise = stacked(rows)
@@ -278,8 +278,8 @@ class PathPass(TrackSteps):
             error, chi2 = told_by(main, H, y, noise, np.concatenate(more), of_lights, others=others)
             self._off = self._off + error
             if lights:
-                main.surprise += chi2
-                main.told += len(y)
+                main.chi2 += chi2
+                main.chi2_dof += len(y)
                 main.light_s = max(main.light_s, *(t_s for t_s, _, _ in lights))
         return replace(
             step, after=self._off, covariance=main.covariance, status=main.status, looks=(*step.looks, *looks)

@@ -142,7 +142,7 @@ class TrackSights(TrackMoves):
         # What another estimate chose may be behind the camera by this one.
         if len(chosen := in_front(found.chosen, y)) < len(found.chosen):
             found = replace(found, chosen=chosen)
-        estimate.trigger = [seen for seen in estimate.trigger if abs(sight.t_s - seen[0]) < ONE_TRIGGER_S]
+        estimate.trigger_lights = [seen for seen in estimate.trigger_lights if abs(sight.t_s - seen[0]) < ONE_TRIGGER_S]
         estimate.evidence += found.evidence
         estimate.evidence_by[observer] += found.evidence
         if found.chosen:
@@ -163,7 +163,7 @@ class TrackSights(TrackMoves):
                 estimate.bars += 1
                 estimate.bar_s = sight.t_s
                 estimate.late_bars += sight.t_s > estimate.start_s + REFLECTED_S
-            estimate.told_by[observer] += 1
+            estimate.lit_pictures[observer] += 1
         return Look(observer, sight.stamp_ns, sight.t_s, found.chosen), turn
 
     def _turning_s(self, estimate: Estimate) -> dict[int, float]:
@@ -264,12 +264,12 @@ class TrackSights(TrackMoves):
         stretched = by_scale(rows_H, estimate.state, other, lights_m), own
         error, chi2 = told_by(estimate, rows_H, rows_y, noise, more, doubts, stretched)
         estimate.state = estimate.state.plus(error)
-        estimate.lasted += 2 * sum(float(sight.lasting_s[k]) > 0.0 for k, *_ in found.chosen)
+        estimate.lasting_dof += 2 * sum(float(sight.lasting_s[k]) > 0.0 for k, *_ in found.chosen)
         note_lit(estimate, sight, used)
-        estimate.surprise += chi2
-        estimate.told += len(rows_y)
+        estimate.chi2 += chi2
+        estimate.chi2_dof += len(rows_y)
         estimate.light_s, estimate.lit_m = max(estimate.light_s, sight.t_s), float(estimate.state.range_m)
-        estimate.trigger += [(sight.t_s, sight.node, light) for _, light, _ in found.chosen]
+        estimate.trigger_lights += [(sight.t_s, sight.node, light) for _, light, _ in found.chosen]
         return used
 
     def _apply(self, estimate: Estimate, H: Floats, y: Floats, noise: Floats) -> None:

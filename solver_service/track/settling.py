@@ -55,30 +55,30 @@ REFUTING_PASSES: Final = 2
 class _Asked:
     """What is asked of the last pass over a dive.
 
-    doubtful: whether the first path may have been far off throughout. told: how many pictures the first pass used.
-    used (2,): the same of A and of B, by its path. contradicted: so many fixes may contradict the last path. Where more
-    do, passes go on up to that of number patience, and end without a track.
+    doubtful: whether the first path may have been far off throughout. lit_pictures: in how many the first pass used a
+    light. used (2,): the same of A and of B, by its path. contradicted: so many fixes may contradict the last path.
+    Where more do, passes go on up to that of number patience, and end without a track.
     """
 
     doubtful: bool
-    told: int
+    lit_pictures: int
     used: NDArray[np.int64]
     contradicted: float
     patience: int = PASSES
 
 
 def settled(
-    path: Path, detection: Floats, shaking: Shaking, known: PassedOver, told: int, *, doubtful: bool
+    path: Path, detection: Floats, shaking: Shaking, known: PassedOver, lit_pictures: int, *, doubtful: bool
 ) -> tuple[PathPass, Path] | None:
     """Pass over a dive about the last pass's path until that does not move; None where it does not settle.
 
-    told: the pictures that the first pass used. doubtful: whether the path may be far off throughout. Where motion is
-    guessed, each pass has what its path tells of it. Lights that fixes refute are left out at first; if as many fixes
-    contradict what is found then, all begins again with those lights.
+    lit_pictures: in how many the first pass used a light. doubtful: whether the path may be far off throughout. Where
+    motion is guessed, each pass has what its path tells of it. Lights that fixes refute are left out at first; if as
+    many fixes contradict what is found then, all begins again with those lights.
     """
     agreements = _agreements(path, known.fixes)
     against, lighter = _contradictions(agreements), _without_refuted(path, agreements)
-    asked = _Asked(doubtful, told, _used(path), against + MORE_CONTRADICTED * len(known.fixes))
+    asked = _Asked(doubtful, lit_pictures, _used(path), against + MORE_CONTRADICTED * len(known.fixes))
     if lighter is not None:
         fewer = replace(asked, contradicted=against - 1, patience=REFUTING_PASSES)
         again = _settled(lighter, detection, shaking, known, fewer)
@@ -126,7 +126,7 @@ def _settled(
             if tells and max(LEFT_CLOCK_S, LEFT_SIGMAS * clock_sigma_s(path)) < abs(left_s) < LOST_CLOCK_S:
                 known, path = replace(known, clock_ns=known.clock_ns + round(left_s * 1e9)), path.later(left_s)
                 continue
-            fits = passed.surprise < UNFIT * passed.told and sum(passed.told_by) > LEAST_TOLD * asked.told
+            fits = passed.chi2 < UNFIT * passed.chi2_dof and sum(passed.lit_pictures) > LEAST_TOLD * asked.lit_pictures
             fits = fits and not (guesses and (_used(path) < GUESSING_TOLD * asked.used).any())
             # A path may end long before the dive does: what is wrong at its end may have ended.
             track.goes_on_to(track.seconds(0, last_ns(known.records) - S_NS))

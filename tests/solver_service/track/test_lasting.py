@@ -69,7 +69,7 @@ def test_lights_whose_errors_last_keep_their_own_chi2_and_tell_nothing_of_gaps(d
         track = filter_of((records[0], records[1]), dive.fixes)
         track.advance(last_ns(records))
         assert track.main is not None
-        assert track.main.surprise / track.main.told > 0.3
+        assert track.main.chi2 / track.main.chi2_dof > 0.3
         assert _unrest([track.main]) == pytest.approx(asked, abs=0.01)
 
 

@@ -100,7 +100,7 @@ def test_a_start_is_weighed_without_the_doubt_of_its_clock_and_moved_with_it(mon
     frames = sorted(frame.stamp_ns for record in dive.records for frame in record.frames)
     track.advance(frames[4])
     assert track.main is not None
-    assert track.main.told_by != [0, 0]
+    assert track.main.lit_pictures != [0, 0]
     assert not track.main.confirmed
     track.advance(frames[-1])
     assert {sigma_px for known, sigma_px in weighed if not known} == {Setting().sigma_px}
