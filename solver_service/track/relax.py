@@ -32,7 +32,7 @@ from buddyline.solver_service.track.seeing import (
     PassGuide,
     counted,
     counted_more,
-    doubted,
+    doubts_of,
     found_now,
     in_front,
     learn_found,
@@ -260,7 +260,7 @@ class PathPass(TrackSteps):
             residuals = None
             if found.chosen:
                 more.append(counted_more(found.chosen, counts))
-                doubts.append(doubted(found.chosen, sight))
+                doubts.append(doubts_of(found.chosen, sight))
                 note_lit(main, sight, counts)
                 H, y, noise = light_rows(found.chosen, by_path.y, by_path.H)
                 rows.append((H, y, noise))

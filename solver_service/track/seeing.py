@@ -155,7 +155,7 @@ class TrackSights(TrackMoves):
         if found.chosen:
             if not estimate.confirmed:
                 estimate.used[observer, sight.stamp_ns] = found.chosen
-                found = replace(found, chosen=_doubted(found.chosen, estimate, sight, H))
+                found = replace(found, chosen=_widened_lights(found.chosen, estimate, sight, H))
             found = replace(found, chosen=self._update_lights(estimate, found, y, H, sight))
             if estimate.unseen_by == observer:
                 estimate.unseen_by = None
@@ -254,7 +254,7 @@ class TrackSights(TrackMoves):
         used = counted(found.chosen, sight, estimate)
         rows_H, rows_y, noise = light_rows(found.chosen, y, H)
         more = counted_more(found.chosen, used)
-        doubts = doubted(found.chosen, sight) if estimate.confirmed else np.zeros(len(rows_y))
+        doubts = doubts_of(found.chosen, sight) if estimate.confirmed else np.zeros(len(rows_y))
         other = 1 - sight.node
         lights_m = self.nodes[other].rig.lights_m[[light for _, light, _ in found.chosen]]
         # Where motion is guessed, errors that last are not counted in the noise, and a gap must not be made of them.
@@ -396,7 +396,7 @@ def counted_more(chosen: Chosen, used: Chosen) -> Floats:
     return np.array([more, more]).T.ravel()
 
 
-def doubted(chosen: Chosen, sight: Sight) -> Floats:
+def doubts_of(chosen: Chosen, sight: Sight) -> Floats:
     """Give what the variances of lights (2 N,) have for doubts, by `doubt_of`."""
     sigma_px = sight.sigma_px.tolist()
     return np.array([doubt_of(variance, sigma_px[k]) for k, _, variance in chosen for _ in (0, 1)])
@@ -434,7 +434,7 @@ def in_front(chosen: Chosen, y: Floats) -> Chosen:
     return tuple(one for one in chosen if math.isfinite(y[one[0], one[1], 0]))
 
 
-def _doubted(chosen: Chosen, start: Estimate, sight: Sight, H: Floats) -> Chosen:
+def _widened_lights(chosen: Chosen, start: Estimate, sight: Sight, H: Floats) -> Chosen:
     """Give a start's lights with the variances that move it: widened, if it began with a fix and has both units.
 
     Without units a start would drift off by guessed motion before it knows its velocity. One without a fix is replayed
