@@ -10,7 +10,7 @@ from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.lights import Sight
 from buddyline.solver_service.track.smoother import Path, smoothed
-from buddyline.solver_service.track.start import broad_start
+from buddyline.solver_service.track.start import broad_covariance
 from buddyline.solver_service.track.trail import Step
 
 # Backward for no longer than this: by inertial units alone the state is too uncertain beyond.
@@ -28,9 +28,8 @@ class EarlierFilter(TrackFilter):
         start_s, state = float(path.t_s[0]), path.state(0)
         at_start = Estimate(start_s, state, np.zeros((0, 0)), start_s)
         begun = self._rewound(at_start, since_s)
-        estimate = Estimate(
-            since_s, *broad_start(self.nodes, begun, self.clock_sigma_s), since_s, confirmed=True, light_s=since_s
-        )
+        P = broad_covariance(self.nodes, begun, self.clock_sigma_s)
+        estimate = Estimate(since_s, begun, P, since_s, confirmed=True, light_s=since_s)
         self._open(estimate)
         while self._events and self._events[0][0] < start_s - 1e-6:
             t_s, _, _, what = heapq.heappop(self._events)

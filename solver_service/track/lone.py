@@ -14,7 +14,7 @@ import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.courses import lamp_courses
 from buddyline.solver_service.track.start import (
-    broad_start,
+    broad_covariance,
     constants_of,
 )
 from buddyline.solver_service.track.state import NAV, SIZE, State, invariant_of_plain
@@ -120,4 +120,4 @@ def state_of(window: Window, fit: Fit, clock_sigma_s: float) -> tuple[State, Flo
     known = np.zeros((SIZE, SIZE))
     T = invariant_of_plain(state)[:NAV, :NAV]
     known[:NAV, :NAV] = T @ np.linalg.inv(fit.information)[:NAV, :NAV] @ T.T
-    return broad_start(window.nodes, state, clock_sigma_s, known)
+    return state, broad_covariance(window.nodes, state, clock_sigma_s, known)

@@ -20,7 +20,7 @@ from buddyline.solver_service.track.search import starts
 from buddyline.solver_service.track.seeing import in_front
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.smoother import smoothed
-from buddyline.solver_service.track.start import CLOCK_S, constants_of
+from buddyline.solver_service.track.start import constants_of, enter_attitudes
 from buddyline.solver_service.track.state import PHI, R_, State, of_place, place_covariance
 from buddyline.solver_service.track.stepping import TICK_S, TrackSteps
 from buddyline.solver_service.track.trail import Chosen, Trail
@@ -57,7 +57,7 @@ class TrackPool(TrackSteps):
     searches: whether any may start without a fix.
     """
 
-    def __init__(self, nodes: tuple[TrackNode, TrackNode], keep_s: float, clock_sigma_s: float = CLOCK_S) -> None:
+    def __init__(self, nodes: tuple[TrackNode, TrackNode], keep_s: float, clock_sigma_s: float) -> None:
         super().__init__(nodes, keep_s)
         self.clock_sigma_s = clock_sigma_s
         self.main: Estimate | None = None
@@ -129,9 +129,7 @@ class TrackPool(TrackSteps):
         state = untold.moved(state.r_m, state.v_mps, state.R)
         P = np.diag(variances)
         P[R_, R_] = np.diag(np.maximum(place, REPLAY_SHARE * range_m) ** 2)
-        level = REPLAY_RAD**2 * np.eye(3)
-        P[PHI[0], PHI[0]] = P[PHI[0], PHI[1]] = P[PHI[1], PHI[0]] = level
-        P[PHI[1], PHI[1]] = level + np.diag(np.maximum(learned[PHI[1]], REPLAY_RAD) ** 2)
+        enter_attitudes(P, REPLAY_RAD**2 * np.eye(3), np.diag(np.maximum(learned[PHI[1]], REPLAY_RAD) ** 2))
         begun = Estimate(
             estimate.start_s,
             state,

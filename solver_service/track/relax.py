@@ -43,7 +43,7 @@ from buddyline.solver_service.track.seeing import (
 )
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.smoother import Path
-from buddyline.solver_service.track.start import CLOCK_S, broad_start, constants_of
+from buddyline.solver_service.track.start import CLOCK_S, broad_covariance, constants_of
 from buddyline.solver_service.track.state import MOVING, State
 from buddyline.solver_service.track.stepping import DEPTH_GATE, TrackSteps
 from buddyline.solver_service.track.strapdown import (
@@ -126,7 +126,7 @@ class PathPass(TrackSteps):
         # Constants are believed as at first, whatever a pass before made of the same lights.
         told, _ = constants_of(self.nodes, first.R, first.r_m, known.clock_sigma_s)
         place_m = BROAD_SHARE * float(np.linalg.norm(first.r_m))
-        _, P = broad_start(self.nodes, first, known.clock_sigma_s, shaking=shaking, place_m=place_m)
+        P = broad_covariance(self.nodes, first, known.clock_sigma_s, shaking=shaking, place_m=place_m)
         self.passed = Estimate(
             start_s,
             first,

@@ -73,15 +73,21 @@ def constants_of(
     return state, sigma**2
 
 
-def broad_start(
+def enter_attitudes(P: Floats, of_a: Floats, relative: Floats) -> None:
+    """Enter attitudes into a covariance: A's errs by of_a (3, 3), and B's by as much and by relative against A."""
+    P[PHI[0], PHI[0]] = P[PHI[0], PHI[1]] = P[PHI[1], PHI[0]] = of_a
+    P[PHI[1], PHI[1]] = of_a + relative
+
+
+def broad_covariance(
     nodes: tuple[TrackNode, TrackNode],
     state: State,
-    clock_sigma_s: float = CLOCK_S,
+    clock_sigma_s: float,
     known: Floats | None = None,
     shaking: Shaking | None = None,
     place_m: float = BROAD_R_M,
-) -> tuple[State, Floats]:
-    """Give a state to start again from, with a covariance that holds next to nothing of the lights yet.
+) -> Floats:
+    """Give the covariance (SIZE, SIZE) of a state to start again from: it holds next to nothing of the lights yet.
 
     known (SIZE, SIZE): its covariance by an earlier pass, of which BROAD_SIGMAS are kept: from a broader start the
     first updates would be far from linear. shaking: as it was learned. place_m: 1 sd of the place.
@@ -91,16 +97,15 @@ def broad_start(
         variances[NAV:MOVING] = np.repeat(shaking.variances, 3)
     P = np.diag(variances)
     P[R_, R_] = place_m**2 * np.eye(3)
-    level = BROAD_TURN_RAD**2 * np.eye(3)
-    P[PHI[0], PHI[0]] = P[PHI[0], PHI[1]] = P[PHI[1], PHI[0]] = level
-    P[PHI[1], PHI[1]] = level + BROAD_TURN_RAD**2 * np.eye(3)
+    turn = BROAD_TURN_RAD**2 * np.eye(3)
+    enter_attitudes(P, turn, turn)
     P = of_place(state, P)
     if known is not None:
         least = np.diag([LEAST_BROAD**2] * NAV)
         narrow = BROAD_SIGMAS**2 * known[:NAV, :NAV] + least
         P[:NAV, :NAV] = P[:NAV, :NAV] @ np.linalg.solve(P[:NAV, :NAV] + narrow, narrow)
         P = 0.5 * (P + P.T)
-    return state, P
+    return P
 
 
 def tilt_of(force_mps2: Floats) -> Floats | None:
@@ -121,7 +126,7 @@ def state_from_fix(
     fix: FixSeen,
     attitude: AttitudeSeen | None,
     force_mps2: Floats | None,
-    clock_sigma_s: float = CLOCK_S,
+    clock_sigma_s: float,
 ) -> tuple[State, Floats] | None:
     """Start from a fix, with A's attitude by its message or else its accelerometer; None where neither tells.
 
@@ -141,8 +146,7 @@ def state_from_fix(
     # A fix's own covariance is the least; what it leaves out (frames apart, calibration) is a little more.
     from_fix = turn @ fix.covariance @ turn.T + np.diag([1e-4] * 3 + [1e-5] * 3)
     P[R_, R_] = from_fix[:3, :3]
-    P[PHI[0], PHI[0]] = P[PHI[0], PHI[1]] = P[PHI[1], PHI[0]] = level
-    P[PHI[1], PHI[1]] = level + from_fix[3:, 3:]
+    enter_attitudes(P, level, from_fix[3:, 3:])
     P[R_, PHI[1]] = from_fix[:3, 3:]
     P[PHI[1], R_] = from_fix[3:, :3]
     return state, of_place(state, P)
