@@ -29,7 +29,7 @@ def track_message(row: TrackRow, node_a: str, node_b: str, mode: TrackMode, *, o
         v_covariance=row.v_covariance.ravel().tolist(),
         mode=mode,
         lights=row.lights,
-        age_s=max(row.age_s, 0.0),
+        age_s=row.age_s,
         range_m=row.range_m,
         t_ned_m=_triple(row.t_ned_m) if oriented else UNSET,
         sigma_ned_m=_triple(row.sigma_ned_m) if oriented else UNSET,
