@@ -116,9 +116,7 @@ class NetTracker:
             try:
                 return self._take(fixes, self._frontier_ns())
             except NUMERIC_ERRORS as error:
-                self._note([f"values were out of numeric range ({error}): the network started anew"])
-                self.forget()
-                return self._with_left([])
+                return self._started_anew(str(error))
 
     def finish(self) -> list[Message]:
         """Take what is left, at the end of the dive."""
@@ -129,9 +127,13 @@ class NetTracker:
                 messages = self._take([], max(self._settled_ns.values(), default=0) + S_NS)
                 return messages + (self._rest(self._filter) if self._filter is not None else [])
             except NUMERIC_ERRORS as error:
-                self._note([f"values were out of numeric range ({error}): the network started anew"])
-                self.forget()
-                return self._with_left([])
+                return self._started_anew(str(error))
+
+    def _started_anew(self, why: str) -> list[Message]:
+        """Drop a network that absurd but finite values have spoiled; return what an earlier one has left."""
+        self._note([f"values were out of numeric range ({why}): the network started anew"])
+        self.forget()
+        return self._with_left([])
 
     def _rest(self, track: NetFilter) -> list[Message]:
         """Return what is still to be smoothed; nothing where absurd values have spoiled it."""
