@@ -32,7 +32,7 @@ class StepsAhead:
     at: a step's place by its two times. constants (2, 13): that they were integrated about, in the order of TOLERANCES.
     R (M, 2, 3, 3). gained (M, 2, 2, 3): dv, dp. jacobian (M, 2, 3, 3, OWN + 2): of attitude, dv and dp, with the
     shares' two columns last. by_change (M, 2, 3, 3, 13): of the same by the constants, to correct them. rates_radps (M,
-    2, 3): uncorrected, at the end. sudden_rad (M, 2): as in Increments.
+    2, 3): uncorrected, at the end. sudden_rad (M, 2): as in Increments. by_shares: whether the shares were asked for.
     """
 
     at: dict[tuple[float, float], int]

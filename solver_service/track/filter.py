@@ -178,7 +178,7 @@ class TrackFilter(TrackPool):
         main = self.main
         if main is None:
             return False
-        founded = not main.searched or main.agreed > 0 or self._followed(main)
+        founded = not main.searched or main.agreed > 0 or self._founded_by_pictures(main)
         # A pair at rest tells little of its clocks, and less than it believes; a start that is not told may be wrong.
         far_s = max(FAR_CLOCK_S, FAR_SIGMAS * math.sqrt(main.covariance[CLOCK, CLOCK]))
         if founded and abs(main.state.clock_s) > far_s:
@@ -199,7 +199,7 @@ class TrackFilter(TrackPool):
         return apart or contradicted or not founded or (unequal and abs(main.scale.share) > MOST_GAP)
 
     @staticmethod
-    def _followed(main: Estimate) -> bool:
+    def _founded_by_pictures(main: Estimate) -> bool:
         """Whether enough pictures have shown both lights to found a start without a fix."""
         lately = main.light_s - main.bar_s < LONE_S
         return main.late_bars >= LATE_BARS and (main.bars >= BARS_TO_FOLLOW or lately)
@@ -312,7 +312,7 @@ class TrackFilter(TrackPool):
         if made is None:
             return None
         state, covariance = made
-        if attitudes[1] is not None and not self._faces(state, covariance, attitudes[1][1]):
+        if attitudes[1] is not None and not self._agrees_with(state, covariance, attitudes[1][1]):
             self._refused += 1
             if self._refused >= REFUSED_TO_SAY:
                 why = "another's lights, or a wrong mount"
@@ -327,7 +327,7 @@ class TrackFilter(TrackPool):
         self._open(estimate)
         return estimate
 
-    def _faces(self, state: State, P: Floats, seen: AttitudeSeen) -> bool:
+    def _agrees_with(self, state: State, P: Floats, seen: AttitudeSeen) -> bool:
         """Whether B's attitude by a fix agrees with its message, whose compass iron may deflect.
 
         Two nodes that both look at a third node's bar can make a fix, but their headings contradict it.
@@ -352,7 +352,7 @@ class TrackFilter(TrackPool):
             for challenger in self.challengers:
                 gained = main.evidence - challenger.baseline
                 better = challenger.evidence > max(gained, 0.0) + REPLACED and min(challenger.evidence_by) > MUTUAL
-                if better and self._is_whole(challenger, FIXES_TO_REPLACE, math.inf):
+                if better and self._is_supported(challenger, FIXES_TO_REPLACE, math.inf):
                     # What went wrong did so after the last fix that agreed; without any it may never have been right.
                     if main.agreed:
                         main.end_s = min(challenger.start_s, main.agreed_s)
@@ -375,7 +375,7 @@ class TrackFilter(TrackPool):
             best
             and best.evidence > CONFIRMED
             and min(best.evidence_by) > MUTUAL
-            and self._is_whole(best, FIXES_TO_CONFIRM, 2 * BARS)
+            and self._is_supported(best, FIXES_TO_CONFIRM, 2 * BARS)
         ):
             if not all(self._leads(best, rival) for rival in self.challengers):
                 return
@@ -385,7 +385,9 @@ class TrackFilter(TrackPool):
             self._confirm(best)
 
     def _confirm(self, estimate: Estimate) -> None:
-        self.main = self._again(estimate)
+        """Make an estimate the confirmed track, replayed if it started without a fix."""
+        replays = estimate.searched and not (estimate.lone or any(estimate.without))
+        self.main = self._replayed(estimate) if replays else estimate
         self.main.confirmed = True
         # Others are replayed, which tells which lamps are dark.
         for node, t_s, seen in estimate.seen_history if estimate.lone else ():
@@ -409,7 +411,7 @@ class TrackFilter(TrackPool):
         return lead(best, rival) > (0.0 if late else CONFIRMED)
 
     @staticmethod
-    def _is_whole(estimate: Estimate, fixes: int, bars: float) -> bool:
+    def _is_supported(estimate: Estimate, fixes: int, bars: float) -> bool:
         """Whether enough speaks for an estimate beside its log odds.
 
         A start from a fix needs so many fixes that agree, or so many pictures with both lights (bars) and of each node:
@@ -423,12 +425,6 @@ class TrackFilter(TrackPool):
         if estimate.searched:
             return estimate.bars >= BARS and min(estimate.lit_pictures) >= TOLD
         return estimate.agreed >= fixes or min(estimate.bars, *estimate.lit_pictures) >= bars
-
-    def _again(self, estimate: Estimate) -> Estimate:
-        """Give an estimate as it is to be followed once confirmed: replayed, if it started without a fix."""
-        if not estimate.searched or estimate.lone or any(estimate.without):
-            return estimate
-        return self._replayed(estimate)
 
     def _row(self, t_s: float, stamp_ns: int) -> DueRow | None:
         if self.main is None or not self.main.confirmed or t_s < self.main.t_s:

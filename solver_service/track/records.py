@@ -76,7 +76,7 @@ def between(items: Sequence[Stamped], start_ns: int, end_ns: int) -> Sequence[St
 
 
 def stamp_of(item: AttitudeSeen | DepthSeen | FixSeen | FrameSeen) -> int:
-    """Give the key of the order."""
+    """Give the stamp that items are in order of."""
     return item.stamp_ns
 
 
