@@ -227,21 +227,7 @@ def assemble(
         if not leg.from_node and leg.azimuth_deg is not UNSET:
             _add_vector(to, number, project, start, end)
             continue
-        share = project.settings.range_share if leg.from_node else 0.0
-        sigma_m = math.sqrt(
-            max(leg.distance_sigma_m**2 - (share * leg.distance_m) ** 2, (OWN_SHARE * leg.distance_sigma_m) ** 2)
-        )
-        terms = []
-        if share:
-            name = scale_name(leg)
-            if of.has(name) is None:
-                # Known lines or fixed points may tell the scale better than the calibration does.
-                beforehand = len(of.value)
-                of.loosen[beforehand] = of.unknown(name, share), SCALE_FREE
-            terms = [(of.unknown(name), 1.0)]
-        to.observations.rows[number, "distance"] = of.add(
-            "distance", start, end, leg.distance_m, sigma_m, terms, leg=number, what="distance"
-        )
+        _add_distance(to, number, start, end, project.settings.range_share if leg.from_node else 0.0)
         if project.adjust.compass == "use":
             sighted.add(to, number, start, end, turned=(leg.dive, leg.start_ns) in turned)
         elif (leg.dive, leg.start_ns) in turned:
@@ -258,16 +244,41 @@ def assemble(
     _add_known(to, project.known)
     if north_along is not None:
         of.add("azimuth", of.at[north_along[0]], of.at[north_along[1]], 0.0, 1e-6, what="arbitrary north")
+    _add_fixed(to, fixed, origin_m)
+    return of
+
+
+def _add_distance(to: Assembly, number: int, start: int, end: int, share: float) -> None:
+    """Add a leg's distance. share: 1 sd of the scale that all distances of its two rigs share, 0 for none."""
+    of, leg = to.observations, to.legs[number]
+    sigma_m = math.sqrt(
+        max(leg.distance_sigma_m**2 - (share * leg.distance_m) ** 2, (OWN_SHARE * leg.distance_sigma_m) ** 2)
+    )
+    terms = []
+    if share:
+        name = scale_name(leg)
+        if of.has(name) is None:
+            # Known lines or fixed points may tell the scale better than the calibration does.
+            beforehand = len(of.value)
+            of.loosen[beforehand] = of.unknown(name, share), SCALE_FREE
+        terms = [(of.unknown(name), 1.0)]
+    of.rows[number, "distance"] = of.add(
+        "distance", start, end, leg.distance_m, sigma_m, terms, leg=number, what="distance"
+    )
+
+
+def _add_fixed(to: Assembly, fixed: Fixed, origin_m: Floats) -> None:
+    """Add fixed points. origin_m: (3,), to which coordinates are relative."""
+    of = to.observations
     for name, (position_m, sigmas_m) in fixed.items():
         if name not in of.at:
             continue
         away_m = position_m - origin_m
         for kind, value_m, known_m in zip(("east", "north", "up"), away_m.tolist(), sigmas_m.tolist(), strict=True):
             # Depths give the other altitudes, where there is any depth.
-            if not math.isnan(value_m) or not legs:
+            if not math.isnan(value_m) or not to.legs:
                 at_m = 0.0 if math.isnan(value_m) else value_m
                 of.add(kind, of.at[name], -1, at_m, max(known_m, EXACT_M), what=f"fixed point {name}")  # type: ignore[arg-type]
-    return of
 
 
 def _add_vector(to: Assembly, number: int, project: Project, start: int, end: int) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,7 +15,7 @@ from buddyline.tools.survey.geodesy import utm_epsg
 from buddyline.tools.survey.old.model import LEAST_M, OldShot, OldSurvey, StationName, merged
 from buddyline.tools.survey.old.readers import read_old
 from buddyline.tools.survey.old.systems import crs_of, map_system, moved
-from buddyline.tools.survey.project import STATION_NAME, FixedPoint, Leg, Project, Station
+from buddyline.tools.survey.project import STATION_NAME, FixedPoint, Leg, Place, Project, Station
 from msgspec import UNSET, structs
 
 # 1 sd of an angle that nothing tells, degrees.
@@ -89,17 +89,46 @@ def joined(project: Project, olds: Sequence[OldSurvey]) -> Project:
         structs.replace(leg, from_=same_as(leg.from_), to=same_as(leg.to))
         for leg in [*project.leg, *(leg for old in olds for leg in legs_of(old))]
     ]
-    place = project.place
+    place, system = _place_in_system(project.place, olds)
+    fixes = _fixed_points(project, olds, same_as, stations, system)
+    names = {leg.name for leg in legs}
+    for edit in project.edit:
+        if edit.leg not in names:
+            raise ConfigError(f"edit of leg {edit.leg!r}: no such leg, nor in the old surveys")
+    lines = [structs.replace(one, from_=same_as(one.from_), to=same_as(one.to)) for one in project.known]
+    points = [structs.replace(leg, from_=same_as(leg.from_)) for leg in project.point]
+    stated = {station.name for station in project.station}
+    depths = [
+        structs.replace(one, name=same_as(one.name))
+        for old in olds
+        for one in depths_of(old)
+        if same_as(one.name) not in stated
+    ]
+    return structs.replace(
+        project, leg=legs, point=points, fix=fixes, known=lines, place=place, station=project.station + depths
+    )
+
+
+def _place_in_system(place: Place, olds: Sequence[OldSurvey]) -> tuple[Place, str]:
+    """Return a project's place and its coordinate system: its own, or else that of its old surveys; "" for none."""
     system = next((name for old in olds if (name := map_system(old))), "")
     if system and place.epsg is UNSET and place.utm_zone is UNSET:
         code = crs_of(system).to_epsg()
         if code is not None:
             place = structs.replace(place, epsg=code)
-    wanted = system
     if place.utm_zone is not UNSET:
-        wanted = f"EPSG:{utm_epsg(place.utm_zone)}"
-    elif place.epsg is not UNSET:
-        wanted = f"EPSG:{place.epsg}"
+        return place, f"EPSG:{utm_epsg(place.utm_zone)}"
+    return place, system if place.epsg is UNSET else f"EPSG:{place.epsg}"
+
+
+def _fixed_points(
+    project: Project,
+    olds: Sequence[OldSurvey],
+    same_as: Callable[[StationName], StationName],
+    stations: Collection[StationName],
+    system: str,
+) -> list[FixedPoint]:
+    """Return a project's fixed points, and those of its old surveys in this system; raise ConfigError."""
     fixes: dict[str, FixedPoint] = {
         same_as(fix.station): structs.replace(fix, station=same_as(fix.station)) for fix in project.fix
     }
@@ -114,7 +143,7 @@ def joined(project: Project, olds: Sequence[OldSurvey]) -> Project:
             station = same_as(fix.station)
             if station in stated_here:
                 continue
-            east_m, north_m = moved(fix, wanted) if wanted else fix.position[:2]
+            east_m, north_m = moved(fix, system) if system else fix.position[:2]
             here_m = east_m, north_m, fix.position[2]
             first_m, first_sigmas_m = placed.setdefault(station, (here_m, fix.sigmas_m))
             if station in fixes:
@@ -134,28 +163,7 @@ def joined(project: Project, olds: Sequence[OldSurvey]) -> Project:
                 altitude_sigma_m=fix.sigmas_m[2],
                 entrance=fix.station in old.entrances,
             )
-    names = {leg.name for leg in legs}
-    for edit in project.edit:
-        if edit.leg not in names:
-            raise ConfigError(f"edit of leg {edit.leg!r}: no such leg, nor in the old surveys")
-    lines = [structs.replace(one, from_=same_as(one.from_), to=same_as(one.to)) for one in project.known]
-    points = [structs.replace(leg, from_=same_as(leg.from_)) for leg in project.point]
-    stated = {station.name for station in project.station}
-    depths = [
-        structs.replace(one, name=same_as(one.name))
-        for old in olds
-        for one in depths_of(old)
-        if same_as(one.name) not in stated
-    ]
-    return structs.replace(
-        project,
-        leg=legs,
-        point=points,
-        fix=list(fixes.values()),
-        known=lines,
-        place=place,
-        station=project.station + depths,
-    )
+    return list(fixes.values())
 
 
 def same_place(project: Project, olds: Sequence[OldSurvey]) -> Callable[[StationName], StationName]:
