@@ -124,8 +124,8 @@ def relative_pose(
         return pose
     sigma_rad = of_a.sigma_rad
     if fix.heading is not None and of_b.sigma_rad is not None:
-        stated = float(sigma_rad[2] ** 2), float(of_b.sigma_rad[2] ** 2)
-        doubt = north_doubt((0.0, -fix.heading.gap_rad), stated, fix.heading.variance)
+        stated = np.array((sigma_rad[2], of_b.sigma_rad[2])) ** 2
+        doubt = north_doubt(np.array((0.0, -fix.heading.gap_rad)), stated, np.diag((0.0, fix.heading.variance)))
         sigma_rad = np.array((*sigma_rad[:2], math.sqrt(stated[0] + doubt)))
     return in_ned(pose, rig_a.R_body_camera, of_a.q_ned_body_xyzw, sigma_rad)
 

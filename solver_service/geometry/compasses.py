@@ -11,11 +11,12 @@ from earlier ones needs no such witness: a diver passes by steel.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
 from buddyline.solver_service.geometry.observation import Heading
+from buddyline.solver_service.geometry.rotation import Floats
 
 # Two compasses disagree by no more than this: one near steel points aside, not backwards. The rest of a quarter turn is
 # for the noise of a reading.
@@ -24,6 +25,8 @@ MOST_APART_RAD: Final = math.radians(100.0)
 # in a hundred is of strangers' lamps, and their gaps are spread evenly, then of the poses with this gap one in eighty
 # is (for a sigma of 6 degrees).
 EXPLAINED_CHI2: Final = 6.63
+# A compass is named as the wrong one where that is so likely.
+NAMED: Final = 0.99
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,16 +77,55 @@ def compare_headings(
     return HeadingGap(gap_rad, variance, azimuth_rad, agrees, contradicts)
 
 
-def north_doubt(off_rad: Sequence[float], variances: Sequence[float], variance: float) -> float:
-    """Give what the variance of north gains where two compasses are further apart than they state, rad^2; else 0.
+@dataclass(frozen=True, slots=True)
+class LeaveOneOut:
+    """What compasses (n) say without each: how far it is off the others' mean, that mean, their chi^2 about it, and
+    how likely that compass is the wrong one. chi2: of all about their mean."""
 
-    off_rad (2,): each compass minus the north that is told. variances (2,): as they state, rad^2. variance: of their
-    difference, by what tells how the nodes are turned to each other. One compass is right, and which of the two is as
-    open as their variances say. Where the north that is told is their weighted mean, this is Birge's ratio (Phys. Rev.
-    40, 207, 1932), by which the Particle Data Group widens what two measurements tell that do not agree.
+    gaps_rad: Floats
+    norths_rad: Floats
+    chi2_left: Floats
+    wrong: Floats
+    chi2: float
+
+    @classmethod
+    def of(cls, off_rad: Floats, variances: Floats, covariance: Floats) -> LeaveOneOut:
+        """Leave out each of some compasses; the arguments are those of `north_doubt`."""
+        inverse = np.linalg.inv(covariance + np.diag(variances))
+        weights = inverse.sum(axis=0) / inverse.sum()
+        about_mean = inverse - inverse.sum() * np.outer(weights, weights)
+        told = about_mean @ off_rad
+        gaps = told / np.maximum(np.diag(about_mean), 1e-12)
+        chi2 = float(off_rad @ told)
+        left = chi2 - told * gaps
+        likely = variances * np.exp(0.5 * (left.min() - left))
+        return cls(gaps, weights @ off_rad - weights * gaps, left, likely / likely.sum(), chi2)
+
+
+def wrong_compass(off_rad: Floats, variances: Floats, covariance: Floats) -> tuple[int, float] | None:
+    """Give which compass is wrong, and how far it is off the others, rad; None where they do not agree without it.
+
+    The arguments are those of `north_doubt`. Of two, neither is named.
     """
-    stated, apart = sum(variances), off_rad[1] - off_rad[0]
-    if apart * apart <= stated + variance:
+    without = LeaveOneOut.of(off_rad, variances, covariance)
+    one = int(without.wrong.argmax())
+    named = without.wrong[one] > NAMED and without.chi2_left[one] < EXPLAINED_CHI2 * (len(off_rad) - 2)
+    return (one, float(without.gaps_rad[one])) if named else None
+
+
+def north_doubt(off_rad: Floats, variances: Floats, covariance: Floats) -> float:
+    """Give what the variance of north gains where compasses are further apart than they state, rad^2; else 0.
+
+    off_rad (n,): each compass minus the heading that is told. variances (n,): as they state, rad^2. covariance (n, n):
+    of the headings; only how well it is known how the nodes are turned to each other counts. One compass is wrong, and
+    north is what the others say. Which one is as open as their variances say, and how well the others agree without
+    it. Where they do not, either, their mean is widened by Birge's ratio (Phys. Rev. 40, 207, 1932), as the Particle
+    Data Group widens what measurements tell that do not agree. Of two whose weighted mean is told, all of it is that.
+    """
+    free = len(off_rad) - 1
+    without = LeaveOneOut.of(off_rad, variances, covariance)
+    if without.chi2 <= free:
         return 0.0
-    right = variances[0] * off_rad[1] ** 2 + variances[1] * off_rad[0] ** 2
-    return (1.0 - (stated + variance) / (apart * apart)) * right / stated
+    left = np.maximum(without.chi2_left / max(free - 1, 1) - 1.0, 0.0)
+    apart = without.norths_rad**2 + left / ((1.0 / variances).sum() - 1.0 / variances)
+    return (1.0 - free / without.chi2) * float(without.wrong @ apart)

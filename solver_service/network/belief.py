@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
+from buddyline.solver_service.geometry.compasses import north_doubt, wrong_compass
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log, skew
 from buddyline.solver_service.network.motion import Move, moved_members
 from buddyline.solver_service.network.rows import NetWay, plain_of_posed
@@ -77,7 +78,8 @@ class Member:
 
     light_s: time of the last light that was used of it, or in its pictures. skip_s: earlier lights are not used, for
     they made it a member. evidence: log odds over clutter since it joined. without: it has no inertial unit now.
-    turning_off (3,), looks_away: as in the track's estimate, of its own turning and its own pictures.
+    turning_off (3,), looks_away: as in the track's estimate, of its own turning and its own pictures. compass: its
+    heading as its last attitude had it, minus the network's, rad, and the variance that it stated, rad^2.
     """
 
     node: int
@@ -91,6 +93,7 @@ class Member:
     without: bool = False
     turning_off: Floats = field(default_factory=lambda: np.zeros(3))
     looks_away: bool = False
+    compass: tuple[float, float] = (0.0, math.inf)
 
 
 class NetBelief:
@@ -99,7 +102,8 @@ class NetBelief:
     intake: what all nodes have told. places: of the fixed nodes, by index. shaken: logs (2,) of the variances of nodes'
     shaking, where an earlier pass has told them. walked: how far the units' biases walk, over what Noise has. members,
     state, covariance, rates_radps, shaking and t_s: as they are now. trail: what led there, None where nothing is
-    smoothed.
+    smoothed. north_doubt: the variance, rad^2, that north has beside the covariance, as compasses contradict each
+    other.
     """
 
     def __init__(self, intake: TrackIntake) -> None:
@@ -114,6 +118,7 @@ class NetBelief:
         self.shaking = NetShaking.of_none()
         self.t_s = -np.inf
         self.trail: NetTrail | None = None
+        self.north_doubt = 0.0
 
     @property
     def nodes(self) -> Sequence[TrackNode]:
@@ -184,7 +189,7 @@ class NetBelief:
         if not self.members:
             self._note_chosen([])
             self.state, self.covariance, self.rates_radps = None, np.zeros((0, 0)), np.zeros((0, 3))
-            self.shaking = NetShaking.of_none()
+            self.shaking, self.north_doubt = NetShaking.of_none(), 0.0
             return
         if was_anchor:
             # The frame moves with another node from now on.
@@ -399,12 +404,34 @@ class NetBelief:
         first, member.attitude_s = member.attitude_s == -np.inf, self.t_s
         turn = rotation_exp(self.rates_radps[index] * (self.t_s - time_s))
         y, H = self._attitude_residual(index, self.intake.level_camera(member.node, seen) @ turn)
+        self._take_compass(member, float(y[2]), float(seen.sigma_rad[2] ** 2))
         factors = (1.0, 1.0) if first else (2.0 * anchors.TILT_TIME_S / since, 2.0 * anchors.HEADING_TIME_S / since)
         noise = self._attitude_noise(seen, *factors)
         chi2 = float(y @ np.linalg.solve(noise + H @ self.covariance @ H.T, y))
         if chi2 > 16.0:
             noise = noise * (chi2 / 4.0)
         self._apply(H, y, noise)
+
+    def _take_compass(self, member: Member, off_rad: float, variance: float) -> None:
+        """Note by how much a member's compass is off its heading. Where fixed nodes hold the frame, none counts."""
+        if self.places:
+            return
+        member.compass = off_rad, variance
+        _, *compasses = self._compasses()
+        self.north_doubt = north_doubt(*compasses)
+
+    def _compasses(self) -> tuple[list[int], Floats, Floats, Floats]:
+        """Give the members whose compasses have spoken, and the arguments of `north_doubt`."""
+        told = [i for i, one in enumerate(self.members) if math.isfinite(one.compass[1])]
+        off, stated = np.array([self.members[i].compass for i in told]).reshape(-1, 2).T
+        about_down = [block(i).start + PHI.stop - 1 for i in told]
+        return told, off, stated, self.covariance[np.ix_(about_down, about_down)]
+
+    def wrong_compass(self) -> tuple[int, float] | None:
+        """Give the node whose compass is wrong by what the others say, and by how much, rad; None if none is."""
+        told, *compasses = self._compasses()
+        wrong = wrong_compass(*compasses) if len(told) > 2 else None
+        return None if wrong is None else (self.members[told[wrong[0]]].node, wrong[1])
 
     def _attitude_residual(self, index: int, R_level_camera: Floats) -> tuple[Floats, Floats]:
         assert self.state is not None

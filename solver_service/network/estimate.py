@@ -259,9 +259,11 @@ class NetEstimate(NetBelief):
         """Begin a network without fixed nodes at the first node of a pose, by its attitude or its accelerometer."""
         seen = newest_before(self.intake.attitudes[fix.node], t_s + HOLD_S)
         samples = self.intake.samples[fix.node]
+        member = Member(fix.node, t_s, confirmed=False, light_s=t_s, skip_s=t_s + SKIP_S, attitude_s=t_s)
         if seen is not None and t_s - seen[0] < 1.0:
             R = self.intake.level_camera(fix.node, seen[1])
             level = anchors.attitude_covariance(seen[1].R_ned_body, seen[1].sigma_rad, 1.0, 1.0)
+            member.compass = 0.0, float(seen[1].sigma_rad[2] ** 2)
         else:
             tilt = tilt_of(samples.between(t_s - 0.5, t_s, t_s)[1][:, :3].mean(0)) if len(samples) else None
             if tilt is None:
@@ -272,7 +274,7 @@ class NetEstimate(NetBelief):
         own = np.diag(variances)
         own[P_, P_] = own[V_, V_] = 0.0
         own[PHI, PHI] = level
-        self._add(Member(fix.node, t_s, confirmed=False, light_s=t_s, skip_s=t_s + SKIP_S, attitude_s=t_s), state, own)
+        self._add(member, state, own)
         return True
 
     def join(self, t_s: float, fix: PairFix, index: int, node: int) -> None:
@@ -324,7 +326,7 @@ class NetEstimate(NetBelief):
         if self.state is None or not self._ticks_to(t_s):
             return None
         way = self._way(t_s) if t_s - self.t_s > 1e-6 else None
-        return DueNetRow(stamp_ns, self._present(t_s), self.state, self.covariance, way, self.anchor)
+        return DueNetRow(stamp_ns, self._present(t_s), self.state, self.covariance, way, self.anchor, self.north_doubt)
 
     def ask(self, t_s: float, stamp_ns: int) -> None:
         """Note that `smoothed` is to give a row of a time at or after the last picture's, and go on to there."""
@@ -333,7 +335,8 @@ class NetEstimate(NetBelief):
             return
         if t_s - self.t_s > 1e-6:
             self._go(t_s)
-        self.trail.events.append(Told.of(t_s, stamp_ns, self._present(t_s), self.state, self.covariance))
+        present = self._present(t_s)
+        self.trail.events.append(Told.of(t_s, stamp_ns, present, self.state, self.covariance, self.north_doubt))
 
     def _ticks_to(self, t_s: float) -> bool:
         """Go on to less than two ticks before a time; return whether that is not in the past."""
@@ -353,7 +356,8 @@ class NetEstimate(NetBelief):
             sure |= {(one.node, one.since_s) for one in told.members if one.confirmed}
             if since_s < told.t_s <= until_s:
                 present = [replace(one, confirmed=(one.node, one.since_s) in sure) for one in told.members]
-                rows.append(rows_of([told.stamp_ns] * len(present), present, state, own))
+                n = len(present)
+                rows.append(rows_of([told.stamp_ns] * n, present, state, own, np.full(n, told.north_doubt)))
         return [row for of_time in reversed(rows) for row in of_time]
 
     def _present(self, t_s: float) -> list[Present]:

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import copy
 import heapq
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
+from buddyline.protocol.health import HEADINGS_APART_RAD
 from buddyline.protocol.messages import Blink
 from buddyline.solver_service.geometry.rotation import rotation_log, skew
 from buddyline.solver_service.network.belief import KnownPlace
@@ -212,7 +214,10 @@ class NetFilter(TrackIntake):
 
     def _take_sights(self, t_s: float, sights: Sequence[Sight]) -> None:
         self._check_units(t_s)
-        self._check_fixed(t_s)
+        if t_s - self._watched_s >= CHECK_EVERY_S:
+            self._watched_s = t_s
+            self._check_fixed(t_s)
+            self._check_compasses(t_s)
         for sight in sights:
             self._hear(sight.node, t_s)
         if self.main.state is None and self.main.places:
@@ -222,16 +227,21 @@ class NetFilter(TrackIntake):
         self._judge(t_s)
 
     def _check_fixed(self, t_s: float) -> None:
-        """Every CHECK_EVERY_S, say which fixed nodes seem to have moved."""
-        if t_s - self._watched_s < CHECK_EVERY_S:
-            return
-        self._watched_s = t_s
+        """Say which fixed nodes seem to have moved."""
         for node, watch in self._watches.items():
             seen, sunk = newest_before(self.attitudes[node], t_s), newest_before(self.depths[node], t_s)
             R = self.level_camera(node, seen[1]) if seen is not None and t_s - seen[0] < 1.0 else None
             depth_m = sunk[1].depth_m if sunk is not None and t_s - sunk[0] < 1.0 else None
             for problem in watch.judge(t_s, R, depth_m):
                 self._problems.report(problem, t_s)
+
+    def _check_compasses(self, t_s: float) -> None:
+        """Say which compass is the wrong one, where that is known."""
+        wrong = self.main.wrong_compass()
+        if wrong is not None and abs(wrong[1]) > HEADINGS_APART_RAD:
+            name, off_deg = self.nodes[wrong[0]].name, math.degrees(abs(wrong[1]))
+            said = f"its compass is {off_deg:.0f} deg off those of the others: is it near steel, or not calibrated?"
+            self._problems.report(f"{name}: {said}", t_s)
 
     def _judge(self, t_s: float) -> None:
         """Follow the estimate that explains the pictures best."""

@@ -27,6 +27,7 @@ TOLD_SHARE: Final = 0.1
 TOGETHER: Final = 64
 LEAST: Final = 5
 Each = TypeVar("Each")
+_DOWN: Final = np.array((0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +58,8 @@ class NetWay:
 @dataclass(frozen=True, eq=False)
 class DueNetRow:
     """A row that is to be told: the members, their state and covariance (N, N), and the way from there, None where the
-    state is that of the row's time. anchor: the member that the frame moves with, None where it is fixed."""
+    state is that of the row's time. anchor: the member that the frame moves with, None where it is fixed. north_doubt:
+    as of the belief."""
 
     stamp_ns: int
     members: Sequence[Present]
@@ -65,6 +67,7 @@ class DueNetRow:
     covariance: Floats
     way: NetWay | None
     anchor: int | None
+    north_doubt: float
 
 
 def make_rows(due: Sequence[DueNetRow]) -> list[NetRow]:
@@ -80,7 +83,8 @@ def make_rows(due: Sequence[DueNetRow]) -> list[NetRow]:
         if some[0].anchor is not None:
             state, own = _beside_anchors(some, begin, state, F, own)
         stamps_ns = [of.stamp_ns for of in some for _ in of.members]
-        rows += rows_of(stamps_ns, [one for of in some for one in of.members], state, own)
+        doubts = np.array([of.north_doubt for of in some for _ in of.members])
+        rows += rows_of(stamps_ns, [one for of in some for one in of.members], state, own, doubts)
     return rows
 
 
@@ -134,10 +138,13 @@ def _beside_anchors(
     return replace(state, p_m=state.p_m - p, v_mps=state.v_mps - v), own
 
 
-def rows_of(stamps_ns: Sequence[int], members: Sequence[Present], state: NetState, own: Floats) -> list[NetRow]:
+def rows_of(
+    stamps_ns: Sequence[int], members: Sequence[Present], state: NetState, own: Floats, north_doubts: Floats
+) -> list[NetRow]:
     """Give the confirmed ones of members (K) whose places are known well.
 
-    own (K, POSED, POSED): covariances in the errors of `NetState.plus`.
+    own (K, POSED, POSED): covariances in the errors of `NetState.plus`. north_doubts (K,): variances of what turns all
+    about the vertical besides. Whether a place is known well is asked without it.
     """
     J = plain_of_posed(state.p_m, state.v_mps)
     plain = J @ own @ np.swapaxes(J, 1, 2)
@@ -145,6 +152,8 @@ def rows_of(stamps_ns: Sequence[int], members: Sequence[Present], state: NetStat
     known = sigma_m < np.maximum(TOLD_M, TOLD_SHARE * np.sqrt(inner(state.p_m, state.p_m)))
     pose = np.r_[P_, PHI]
     covariances = plain[:, pose[:, None], pose]
+    doubtful = np.flatnonzero(north_doubts)
+    covariances[doubtful] += turned_by_north(state.p_m[doubtful], covariances[doubtful, -1, -1], north_doubts[doubtful])
     return [
         NetRow(
             node=member.node,
@@ -158,6 +167,28 @@ def rows_of(stamps_ns: Sequence[int], members: Sequence[Present], state: NetStat
         for k, (stamp_ns, member, well) in enumerate(zip(stamps_ns, members, known.tolist(), strict=True))
         if member.confirmed and well
     ]
+
+
+def turned_by_north(p_m: Floats, variances: Floats, more: Floats) -> Floats:
+    """Give what covariances (K, 6, 6) of places and attitudes gain where north's variance (K,) does.
+
+    Turned far, a place stays on its arc, by E t sin t, E sin^2 t and E (1 - cos t)^2 of a normal turn t. Of a radian or
+    more nothing is told of north.
+    """
+
+    def of_turn(v: Floats) -> Floats:
+        double = 0.5 * np.exp(-2.0 * v)
+        return np.array((0.5 - double, 1.5 - 2.0 * np.exp(-0.5 * v) + double, v * np.exp(-0.5 * v), v))
+
+    before = np.minimum(variances, 1.0)
+    along, bent, both, turn = of_turn(np.minimum(before + more, 1.0)) - of_turn(before)
+    across, level = np.cross(_DOWN, p_m), p_m * (1.0, 1.0, 0.0)
+    out = np.zeros((len(p_m), 6, 6))
+    out[:, :3, :3] = along[:, None, None] * (across[:, :, None] * across[:, None])
+    out[:, :3, :3] += bent[:, None, None] * (level[:, :, None] * level[:, None])
+    out[:, :3, 5] = out[:, 5, :3] = both[:, None] * across
+    out[:, 5, 5] = turn
+    return out
 
 
 def plain_of_posed(p_m: Floats, v_mps: Floats) -> Floats:

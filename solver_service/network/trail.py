@@ -98,18 +98,24 @@ class Present:
 
 @dataclass(frozen=True, eq=False)
 class Told:
-    """The members at a row's time; covariance (9 n, N): of place, velocity and attitude of each with all errors."""
+    """The members at a row's time; covariance (9 n, N): of place, velocity and attitude of each with all errors.
+
+    north_doubt: as of the belief.
+    """
 
     t_s: float
     stamp_ns: int
     members: tuple[Present, ...]
     state: NetState
     covariance: Floats
+    north_doubt: float
 
     @classmethod
-    def of(cls, t_s: float, stamp_ns: int, members: Sequence[Present], state: NetState, P: Floats) -> Told:
+    def of(
+        cls, t_s: float, stamp_ns: int, members: Sequence[Present], state: NetState, P: Floats, north_doubt: float
+    ) -> Told:
         """Take what a row needs."""
-        return cls(t_s, stamp_ns, tuple(members), state, P[_posed(len(state))])
+        return cls(t_s, stamp_ns, tuple(members), state, P[_posed(len(state))], north_doubt)
 
     def smoothed(self, mu: Floats, L: Floats) -> tuple[NetState, Floats]:
         """Give the state by all pictures, and the covariances (n, 9, 9) of each member's place, velocity, attitude."""

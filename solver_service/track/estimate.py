@@ -132,12 +132,10 @@ class Estimate:
     def take_compass(self, node: int, off_rad: float, variance: float) -> None:
         """Note by how much a node's compass is off the track's heading, and the variance that it states."""
         self.compasses[node] = off_rad, variance
-        (off_a, stated_a), (off_b, stated_b) = self.compasses
-        if math.isfinite(stated_a + stated_b):
-            # How the nodes are turned to each other, about the vertical.
-            P, a, b = self.covariance, PHI[0].stop - 1, PHI[1].stop - 1
-            relative = float(P[a, a] + P[b, b] - 2.0 * P[a, b])
-            self.north_doubt = north_doubt((off_a, off_b), (stated_a, stated_b), relative)
+        off, stated = np.array(self.compasses).T
+        if np.isfinite(stated).all():
+            about_down = [phi.stop - 1 for phi in PHI]
+            self.north_doubt = north_doubt(off, stated, self.covariance[np.ix_(about_down, about_down)])
 
     @property
     def lights(self) -> int:

@@ -7,7 +7,13 @@ import pytest
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import RelativePose
 from buddyline.solver_service.core import SolverCore
-from buddyline.solver_service.geometry.compasses import Contradiction, HeadingGap, compare_headings, north_doubt
+from buddyline.solver_service.geometry.compasses import (
+    Contradiction,
+    HeadingGap,
+    compare_headings,
+    north_doubt,
+    wrong_compass,
+)
 from buddyline.solver_service.geometry.observation import Heading
 from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.witness import FEWEST, MOST, Witnesses
@@ -99,30 +105,44 @@ def test_after_a_pause_no_fewer_witnesses_are_needed():
 
 
 def test_north_is_doubtful_as_compasses_contradict_each_other():
-    variances, of_pose = (0.05**2, 0.1**2), 0.01**2
-    weights = np.array((variances[1], variances[0])) / sum(variances)
+    variances, of_pose = np.array((0.05**2, 0.1**2)), np.diag((0.0, 0.01**2))
+    weights = variances[::-1] / variances.sum()
     # Within what they state, nothing is doubtful.
-    assert north_doubt((0.0, 0.1), variances, of_pose) == 0.0
+    assert north_doubt(np.array((0.0, 0.1)), variances, of_pose) == 0.0
     # Of their weighted mean, it is what Birge's ratio makes of it.
     off_rad = 0.4 * np.array((-weights[1], weights[0]))
-    mean_variance = variances[0] * variances[1] / sum(variances)
-    birge = mean_variance * 0.4**2 / sum(variances)
-    assert north_doubt(off_rad.tolist(), variances, 0.0) == pytest.approx(birge - mean_variance)
+    mean_variance = variances.prod() / variances.sum()
+    birge = mean_variance * 0.4**2 / variances.sum()
+    assert north_doubt(off_rad, variances, np.zeros((2, 2))) == pytest.approx(birge - mean_variance)
+    # How well all headings are known together does not count.
+    of_all = np.full((2, 2), 0.3**2)
+    assert north_doubt(off_rad, variances, of_all) == pytest.approx(birge - mean_variance)
 
 
-def test_north_errs_as_stated_whichever_compass_is_off():
+@pytest.mark.parametrize(("nodes", "wrong"), [(1, 0), (2, 1), (3, 1), (4, 1), (4, 2)])
+def test_north_errs_as_stated_whichever_compass_is_off(nodes, wrong):
     rng = np.random.default_rng(4)
-    sigma_rad, squares = math.radians(4.0), []
+    sigma_rad, squares, named = math.radians(4.0), [], []
+    variances = np.full(nodes, sigma_rad**2)
     for off in rng.choice((-1.0, 1.0), 2000) * math.radians(25.0):
-        compasses = sigma_rad * rng.standard_normal(2)
-        compasses[rng.integers(2)] += off
-        # As a pose tells it, by A's compass, and as a track does, by the mean of both.
-        for north, told in ((compasses[0], sigma_rad**2), (compasses.mean(), sigma_rad**2 / 2.0)):
-            doubt = north_doubt((compasses - north).tolist(), (sigma_rad**2, sigma_rad**2), 0.0)
+        compasses = sigma_rad * rng.standard_normal(nodes)
+        which = rng.permutation(nodes)[:wrong]
+        compasses[which] += off
+        # As a pose tells it, by A's compass, and as a track or a network does, by the mean of all.
+        for north, told in ((compasses[0], sigma_rad**2), (compasses.mean(), sigma_rad**2 / nodes)):
+            doubt = north_doubt(compasses - north, variances, np.zeros((nodes, nodes)))
             squares.append(north**2 / (told + doubt))
-    by_pose, by_track = np.reshape(squares, (-1, 2)).mean(axis=0)
-    assert 0.7 < by_pose < 1.3
-    assert 0.7 < by_track < 1.3
+        found = wrong_compass(compasses, variances, np.zeros((nodes, nodes)))
+        named.append(None if found is None else found[0] in which)
+    by_one, by_mean = np.reshape(squares, (-1, 2)).mean(axis=0)
+    # Where half of four are off alike, nothing tells it.
+    assert 0.6 < by_one < (2.0 if wrong == 2 else 1.3)
+    assert 0.7 < by_mean < (2.5 if wrong == 2 else 1.4)
+    # By a majority one is named, and hardly ever a sound one.
+    told = wrong == 1 and nodes > 2
+    assert (named.count(True) > 1500) == told
+    assert named.count(None) > 1900 or told
+    assert named.count(False) < 40
 
 
 def at_rest(rate_hz, count, gap_deg, scatter_deg, pause_s=0):

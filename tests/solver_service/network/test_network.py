@@ -11,7 +11,7 @@ from buddyline.node.sim import dive as simulation
 from buddyline.node.sim.scenario import DivePlan, Scenario
 from buddyline.node.sim.world import World
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.messages import Candidates, FixedPlace, LightTruth, Message, NodeInfo, NodePose, Truth
+from buddyline.protocol.messages import Attitude, Candidates, FixedPlace, LightTruth, Message, NodeInfo, NodePose, Truth
 from buddyline.solver_service.config import SolveConfig, track_settings
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.rotation import (
@@ -205,6 +205,31 @@ def test_without_a_fixed_node_the_frame_moves_with_one() -> None:
     assert sorted(found) == ["a", "b", "c", "d"]
     # Only the compasses say where north is.
     assert all(rows[:, 0].max() < 1.0 and rows[:, 2].mean() < 2.0 for rows in found.values())
+
+
+@pytest.mark.parametrize("mode", ["filter", "smooth"])
+def test_a_network_says_that_north_is_in_doubt_where_compasses_contradict_each_other(mode: str) -> None:
+    """The wrong compass spoke first: headings were off by 7 to 10 of the sigmas told."""
+    world, messages = dive(8100, 6.0, more_nodes=("c",), fixed_nodes=())
+    poses, core = solved([turned(one, "b", 30.0) for one in messages], mode=mode)
+    assert core.network is not None
+    assert [one for one in core.network.problems if one.startswith("b: its compass is ")]
+    found = errors(world, poses, next(pose.node for pose in poses if pose.p_m == (0.0, 0.0, 0.0)))
+    for node in "abc":
+        P = np.array([pose.covariance for pose in poses if pose.node == node]).reshape(-1, 6, 6)
+        off_m, off_rad, _ = found[node].T
+        assert off_rad.mean() > 0.3
+        assert (off_rad < 2.5 * np.sqrt(P[:, 5, 5])).all()
+        assert (off_m <= 2.5 * np.sqrt(np.trace(P[:, :3, :3], axis1=1, axis2=2))).all()
+
+
+def turned(message: Message, node: str, off_deg: float) -> Message:
+    """A node's compass is off."""
+    if not isinstance(message, Attitude) or message.node != node:
+        return message
+    off = rotation_exp(np.array((0.0, 0.0, np.radians(off_deg))))
+    x, y, z, w = matrix_to_quat(off @ quat_to_matrix(np.array(message.q_ned_body_xyzw))).tolist()
+    return replace(message, q_ned_body_xyzw=(x, y, z, w))
 
 
 @pytest.mark.slow

@@ -8,8 +8,9 @@ from buddyline.node.sim.world import World
 from buddyline.protocol.messages import LightTruth, NodePose, Truth
 from buddyline.solver_service.config import SolveConfig, track_settings
 from buddyline.solver_service.core import SolverCore
+from buddyline.solver_service.geometry.rotation import rotation_exp
 from buddyline.solver_service.network.estimate import NetEstimate
-from buddyline.solver_service.network.rows import make_rows, plain_of_posed
+from buddyline.solver_service.network.rows import make_rows, plain_of_posed, turned_by_north
 from buddyline.solver_service.network.state import P_, PHI, POSED, block
 from buddyline.solver_service.tracking import Coming, PairTracker
 
@@ -45,10 +46,30 @@ def test_rows_are_where_a_step_of_all_members_leads(estimate: NetEstimate) -> No
             J = plain_of_posed(state.p_m[i], state.v_mps[i])
             plain = J @ P[block(i), block(i)][:POSED, :POSED] @ J.T
             which = np.r_[P_, PHI]
+            told = plain[np.ix_(which, which)]
+            told += turned_by_north(state.p_m[[i]], told[-1:, -1], np.array((estimate.north_doubt,)))[0]
             assert row.p_m == pytest.approx(state.p_m[i], abs=1e-12)
             assert row.v_mps == pytest.approx(state.v_mps[i], abs=1e-12)
             assert np.abs(row.R - state.R[i]).max() < 1e-12
-            assert row.covariance == pytest.approx(plain[np.ix_(which, which)], rel=1e-6, abs=1e-15)
+            assert row.covariance == pytest.approx(told, rel=1e-6, abs=1e-15)
             same = alone[k, member.node]
             assert (row.p_m == same.p_m).all()
             assert (row.covariance == same.covariance).all()
+
+
+def test_a_place_that_north_turns_stays_on_its_arc() -> None:
+    """Against turns that are drawn; what the covariance held before comes on top, as it was."""
+    rng, place_m, before, more = np.random.default_rng(1), np.array((3.0, -4.0, 1.5)), 0.1**2, 0.4**2
+    drawn = []
+    for variance in (before, before + more):
+        turns = np.sqrt(variance) * rng.standard_normal(200_000)
+        R = rotation_exp(turns[:, None] * (0.0, 0.0, 1.0))
+        errors = np.concatenate((R @ place_m - place_m, turns[:, None] * (0.0, 0.0, 1.0)), axis=1)
+        drawn.append(errors.T @ errors / len(errors))
+    gained = turned_by_north(place_m[None], np.array((before,)), np.array((more,)))[0]
+    np.testing.assert_allclose(gained, drawn[1] - drawn[0], atol=0.02)
+    # However little is known of north, it is a covariance.
+    for variance in (0.0, 0.1, 1.0, 10.0):
+        for doubt in (1e-4, 0.1, 10.0):
+            gained = turned_by_north(place_m[None], np.array((variance,)), np.array((doubt,)))[0]
+            assert np.linalg.eigvalsh(gained).min() > -1e-9

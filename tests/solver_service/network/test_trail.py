@@ -89,7 +89,7 @@ class RandomCourse:
     def tell(self) -> None:
         present = [Present(k, 0.0, True, 0.0) for k in range(self.n)]
         t_s = float(len(self.told))
-        self.trail.events.append(Told.of(t_s, len(self.told), present, self.state, self.P))
+        self.trail.events.append(Told.of(t_s, len(self.told), present, self.state, self.P, 0.0))
         self.told.append((self.mean_now(exclude=0), self.rows.copy()))
 
     def grow(self) -> None:
