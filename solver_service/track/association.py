@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, islice
 from typing import Final, TypeAlias
 
@@ -60,6 +60,11 @@ class Odds:
     logs: Floats
     y_px: Floats
     spread_px2: Floats
+
+    def times(self, logs: Floats) -> Odds:
+        """Give the odds where each candidate (K) is each light with odds that differ by these logs (K, 2)."""
+        more = [sum(logs[one[0], light] for light, one in enumerate(case) if one is not None) for case in self.cases]
+        return replace(self, logs=self.logs + more)
 
     def weighed(self, detection: Floats, within: Floats = IN_PICTURE) -> tuple[list[Case], Floats]:
         """Give the assignments and the logs of their odds.
@@ -127,15 +132,17 @@ def associate(
     clutter_per_px2: float,
     within: Floats = IN_PICTURE,
     least: float = SURE,
+    by_last: Floats | None = None,
 ) -> Association:
     """Weigh every assignment of candidates (K) to two lights, each of which may be missing.
 
     y (K, 2, 2), H (K, 2, 2, C): residuals and Jacobians, by candidate and light; P (C, C): covariance of the errors.
     within (2,): how likely each light is within the picture; detection (2,): how likely it is then among the
-    candidates. The odds are against clutter alone. least: lights that are more likely are chosen.
+    candidates. The odds are against clutter alone. least: lights that are more likely are chosen. by_last (K, 2): log
+    odds of each candidate being each light, by what the last picture did not show.
     """
     [odds] = odds_of(y[None], H[None], P[None], sigma_px[None], np.array((clutter_per_px2,)))
-    return odds.associate(sigma_px, detection, within, least)
+    return (odds if by_last is None else odds.times(by_last)).associate(sigma_px, detection, within, least)
 
 
 def variance_of(sigma_px: float, common: float, gross: float) -> float:

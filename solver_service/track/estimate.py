@@ -40,7 +40,8 @@ class Estimate:
     rad^2, that north has beside the covariance, as the compasses contradict each other.
 
     The lights: detection (2, 2): by observer and light, how often a light in the picture is found; shown (2, 2): how
-    likely it was to be found at shown_s, by observer, after the last picture had told. last_seen (2,): the probability
+    likely it was to be found at shown_s, by observer, after the last picture had told; missing (2, 2): how likely it
+    would have been seen there if it was within that picture, 0 where it was seen. last_seen (2,): the probability
     that each light is among the last picture's candidates, None where not both should be in it. lit_s (2, 2): when each
     was last used. light_s: when any was, at first the start, which is made of lights; lit_m: the range then.
     trigger_lights: time, observer and light of those of the last trigger. pictures: how many it has taken since it is
@@ -73,6 +74,7 @@ class Estimate:
     rates_radps: Floats = field(default_factory=lambda: np.zeros((2, 3)))
     shown: Floats = field(default_factory=lambda: np.full((2, 2), 0.8))
     shown_s: list[float] = field(default_factory=lambda: [-np.inf, -np.inf])
+    missing: Floats = field(default_factory=lambda: np.zeros((2, 2)))
     lit_s: Floats = field(default_factory=lambda: np.full((2, 2), -np.inf))
     light_s: float = -np.inf
     lit_m: float = math.nan
@@ -162,7 +164,12 @@ class Estimate:
         )
         lists = *of_nodes, "trigger_lights", "evidence_history", "seen_history"
         own: dict[str, object] = {name: list(getattr(self, name)) for name in lists}
-        own |= {"detection": self.detection.copy(), "shown": self.shown.copy(), "lit_s": self.lit_s.copy()}
+        own |= {
+            "detection": self.detection.copy(),
+            "shown": self.shown.copy(),
+            "lit_s": self.lit_s.copy(),
+            "missing": self.missing.copy(),
+        }
         own |= {"steps": self.steps.copy(), "used": dict(self.used)}
         return replace(self, **(own | changes))  # type: ignore[arg-type]
 

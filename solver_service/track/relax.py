@@ -299,7 +299,7 @@ class PathPass(TrackSteps):
         least = SURE if slow else LIKELY
         found = by_path.odds.associate(sight.sigma_px, detection, by_path.within, least)
         main.evidence += found.evidence
-        learn_found(main, observer, sight.t_s, detection, inside, found)
+        learn_found(main, observer, sight.t_s, detection, np.array(inside, float), found)
         if all(inside):
             self.lamps.take(1 - observer, sight.t_s, found.seen)
         return replace(found, chosen=in_front(found.chosen, by_path.y))

@@ -21,6 +21,7 @@ from buddyline.solver_service.track.lights import (
     alike,
     light_positions,
     residuals,
+    share_before,
     share_within,
     with_stamp,
 )
@@ -132,9 +133,12 @@ class TrackSights(TrackMoves):
             found = by_path.odds.associate(sight.sigma_px, detection, within, least)
         else:
             clutter = sight.clutter / camera.area_px2
+            at = estimate.state, estimate.rates_radps, sight.t_s - estimate.t_s
 
             def likely(P: Floats) -> Association:
-                return associate(y, H, with_stamp(P[BLOCK]), sight.sigma_px, detection, clutter, within, least)
+                P = with_stamp(P[BLOCK])
+                now, by_last = self._by_last(estimate, sight, at, within, y, H, P)
+                return associate(y, H, P, sight.sigma_px, detection, clutter, now, least, by_last)
 
             found, estimate.covariance, turn = with_sudden(estimate, self._turning_s(estimate), likely)
         if wide and found.chosen and estimate.confirmed:
@@ -150,7 +154,7 @@ class TrackSights(TrackMoves):
         elif any(inside) and not wide:
             estimate.missed[observer] += 1
         estimate.last_seen = found.seen if all(inside) and not wide else None
-        learn_found(estimate, observer, sight.t_s, detection, inside, found)
+        learn_found(estimate, observer, sight.t_s, detection, within, found)
         estimate.looks_away[observer] = not found.chosen
         if found.chosen:
             if not estimate.confirmed:
@@ -272,6 +276,37 @@ class TrackSights(TrackMoves):
         estimate.trigger_lights += [(sight.t_s, sight.node, light) for _, light, _ in found.chosen]
         return used
 
+    def _by_last(
+        self,
+        estimate: Estimate,
+        sight: Sight,
+        at: tuple[State, Floats, float],
+        within: Floats,
+        y: Floats,
+        H: Floats,
+        P: Floats,
+    ) -> tuple[Floats, Floats]:
+        """Give how likely each light is within a picture, and log odds (K, 2) of its candidates, by the last picture.
+
+        A light that was not seen there, and was in view, was outside. So it has come in since, or is outside still: it
+        is hardly a candidate that stands where it would have been in the last picture, too. at: a state, its turn rates
+        and the picture's time after it.
+        """
+        missing, logs = estimate.missing[sight.node], np.zeros(y.shape[:2])
+        if not estimate.confirmed or not missing.any():
+            return within, logs
+        state, rates_radps, after_s = at
+        camera, lights_m = self.nodes[sight.node].rig.camera, self.nodes[1 - sight.node].rig.lights_m
+        then_s = np.array((after_s + estimate.shown_s[sight.node] - sight.t_s,))
+        X, D = light_positions(state, sight.node, lights_m, rates_radps, then_s)
+        now = within.copy()
+        for light, c in enumerate(missing.tolist()):
+            of_all = y[:, light], H[:, light], sight.sigma_px
+            before, if_now = share_before(camera, X[0, light], D[0, light], P, EDGE_PX, *of_all)
+            logs[:, light] = np.log((1.0 - c * if_now) / (1.0 - c * before))
+            now[light] = max(within[light] - c * min(within[light], before), 0.0) / (1.0 - c * before)
+        return now, logs
+
     def _apply(self, estimate: Estimate, H: Floats, y: Floats, noise: Floats) -> None:
         """Update an estimate by what is no light."""
         error, _ = told_by(estimate, H, y, noise)
@@ -345,7 +380,7 @@ def found_now(estimate: Estimate, observer: int, t_s: float) -> Floats:
 
 
 def learn_found(
-    estimate: Estimate, observer: int, t_s: float, found: Floats, inside: Sequence[bool], association: Association
+    estimate: Estimate, observer: int, t_s: float, found: Floats, within: Floats, association: Association
 ) -> None:
     """Take into an estimate whether each light that should be in a picture was seen there (2,).
 
@@ -353,17 +388,19 @@ def learn_found(
     with a candidate that may be either light teaches nothing: the next ones would repeat what it says of the two.
     """
     estimate.shown[observer], estimate.shown_s[observer] = found, t_s
+    estimate.missing[observer] = found * (1.0 - association.seen)
+    estimate.missing[observer, [light for _, light, _ in association.chosen]] = 0.0
     if association.ambiguous:
         return
     seen = association.seen
     for light in (0, 1):
         share = estimate.detection[observer, light]
-        if inside[light] and share > 0.0:
-            share += 0.05 * (seen[light] - share)
-            estimate.detection[observer, light] = min(max(share, LEAST_FOUND), MOST_FOUND)
-            missed, hidden = found[light] * (1.0 - FOUND_IN_VIEW), FOUND_IN_VIEW - found[light]
-            in_view = seen[light] + (1.0 - seen[light]) * missed / (missed + hidden)
-            estimate.shown[observer, light] = FOUND_IN_VIEW * in_view
+        if share > 0.0:
+            if within[light] > INSIDE:
+                share += 0.05 * (seen[light] - share)
+                estimate.detection[observer, light] = min(max(share, LEAST_FOUND), MOST_FOUND)
+            missing = found[light] * (1.0 - FOUND_IN_VIEW * within[light]) / (1.0 - found[light] * within[light])
+            estimate.shown[observer, light] = FOUND_IN_VIEW * seen[light] + (1.0 - seen[light]) * missing
 
 
 def light_rows(chosen: Chosen, y: Floats, H: Floats) -> tuple[Floats, Floats, Floats]:

@@ -19,6 +19,7 @@ from buddyline.solver_service.track.lights import (
     in_picture,
     light_positions,
     pixel_of,
+    share_before,
     share_within,
     sights_of,
 )
@@ -159,6 +160,38 @@ def test_a_light_behind_the_camera_is_not_within_the_picture() -> None:
     assert share.tolist() == [0.0, 1.0]
 
 
+def test_where_a_light_was_before_by_where_it_stands_now() -> None:
+    camera = Camera("pinhole", 820, 616, 900.0, 900.0, 409.5, 307.5)
+    rng = np.random.default_rng(6)
+    X, D = np.array((0.42, 0.1, 1.0)), np.eye(3, 4)
+    # Errors of the place, and of how far the light has gone since, which is 0.05 to the left.
+    P = np.diag((0.15, 0.08, 0.1, 0.03)) ** 2
+    drawn = rng.normal(0.0, 1.0, (40_000, 4)) * np.sqrt(np.diag(P))
+    H = np.array(((900.0, 0.0, -330.0, -900.0), (0.0, 900.0, -90.0, 0.0)))
+    before = [in_picture(camera, pixel_of(camera, X + D @ error), 2.0) for error in drawn]
+    y = np.array(((-200.0, 30.0), (20.0, 0.0), (np.inf, np.inf)))
+    share, if_now = share_before(camera, X, D, P, 2.0, y, np.broadcast_to(H, (3, 2, 4)), np.full(3, 20.0))
+    assert share == pytest.approx(np.mean(before), abs=0.04)
+    for k in (0, 1):
+        weights = np.exp(-0.5 * ((y[k] - drawn @ H.T) ** 2).sum(axis=1) / 20.0**2)
+        assert if_now[k] == pytest.approx(weights @ before / weights.sum(), abs=0.06)
+    assert if_now[0] > 0.95
+    behind = share_before(camera, -X, D, P, 2.0, y, np.broadcast_to(H, (3, 2, 4)), np.full(3, 20.0))
+    assert behind[0] == 0.0
+    assert not behind[1].any()
+
+
+def test_a_candidate_is_no_light_that_the_last_picture_would_have_shown_there_too() -> None:
+    """In darkness many pictures have false candidates: one of them would soon be near where the lamp may be."""
+    y, H = np.array((((20.0, 0.0),) * 2, ((60.0, 0.0),) * 2)), np.broadcast_to(ALIKE, (2, 2, 2, 2))
+    told = y, H, 80.0**2 * np.eye(2), np.full(2, SIGMA_PX), np.array((0.95, 0.0)), 1.0 / AREA_PX2
+    by_last = np.log(np.array(((0.07,) * 2, (2.5,) * 2)))
+    alone, last = (associate(*told, np.array((0.7, 0.0)), LIKELY, more) for more in (None, by_last))
+    assert alone.seen[0] == pytest.approx(last.seen[0], abs=0.1)
+    assert not alone.chosen
+    assert [one[:2] for one in last.chosen] == [(1, 0)]
+
+
 @pytest.fixture(scope="module")
 def without_units() -> tuple[TrackFilter, Estimate, Sight]:
     """Give a filter of a dive without units, its confirmed estimate, and A's next picture as that predicts it.
@@ -281,6 +314,27 @@ def test_a_start_uses_no_light_that_is_only_likely(without_units: tuple[TrackFil
         used.append([variance for _, _, variance in estimate.steps.last.looks[0].chosen])
     assert max(used[0]) > 7.0**2
     assert not used[1]
+
+
+def test_a_light_that_was_not_seen_must_have_come_in_since(without_units: tuple[TrackFilter, Estimate, Sight]) -> None:
+    """It stands in the middle of the picture, and a tenth of a second before it was not there."""
+    track, known, calm = without_units
+    columns = {name: getattr(calm, name)[:1] for name in ("bearings", "tangents", "sigma_px", "dt_s", "lasting_s")}
+    lone, used = replace(calm, **columns), []
+    for looked in (False, True):
+        lit = np.array(((0.95, 0.0), (0.3, 0.3)))
+        estimate = known.copied(detection=lit, shown=lit.copy())
+        # So much is known of its place that it may well be outside of the picture.
+        estimate.covariance = known.covariance + np.diag(np.isin(np.arange(SIZE), range(3)) * 1.5)
+        [nothing] = sights_of(track.nodes[0].rig, 0, [calm.t_s - 0.1], [FrameSeen(0, np.zeros((0, 2)), np.zeros(0))])
+        if looked:
+            track._take_lights(estimate, nothing)
+            assert 0.9 < estimate.missing[0, 0] < 0.97
+            estimate.shown, estimate.shown_s[0] = lit.copy(), calm.t_s - 0.1
+        look, _ = track._take_lights(estimate, lone)
+        used.append(len(look.chosen))
+    assert used == [1, 0]
+    assert not estimate.missing[1].any()
 
 
 def test_a_picture_of_a_lamp_that_may_be_either_teaches_not_which_is_hidden(

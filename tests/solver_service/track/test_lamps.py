@@ -93,15 +93,15 @@ def test_a_lamp_of_nobody_is_refused():
 
 
 def looked(pictures, first=0.8, second=0.8, *, ambiguous=False):
-    """What node a has learned at 10 Hz, from 0.1 s on: by what is seen of each light, and what should be in view.
+    """What node a has learned at 10 Hz, from 0.1 s on: by what is seen of each light, and how likely it is in view.
 
     ambiguous: whether a candidate may well be either light in each picture.
     """
     state = State.at_rest(np.zeros(3), np.stack((np.eye(3), np.eye(3))))
     told = Estimate(0.0, state, np.eye(SIZE), 0.0, confirmed=True, detection=np.array(((first, second), (0.8, 0.8))))
-    for k, (seen, inside) in enumerate(pictures):
+    for k, (seen, within) in enumerate(pictures):
         t_s = 0.1 * (k + 1)
-        learn_found(told, 0, t_s, found_now(told, 0, t_s), inside, Association((), np.array(seen), 0.0, ambiguous))
+        learn_found(told, 0, t_s, found_now(told, 0, t_s), within, Association((), np.array(seen), 0.0, ambiguous))
     return told, 0.1 * len(pictures)
 
 
@@ -126,6 +126,8 @@ IN_VIEW, HIDDEN = ((1.0, 1.0), (True, True)), ((0.0, 1.0), (True, True))
         ([IN_VIEW] * 40 + [HIDDEN], 0.1, 0.4, 0.7),
         ([IN_VIEW] * 40 + [HIDDEN] * 3, 0.1, 0.0, 0.2),
         ([IN_VIEW] * 40 + [HIDDEN] * 3, 5.0, 0.8, 0.9),
+        # It may as well be outside of these pictures.
+        ([IN_VIEW] * 40 + [((0.0, 1.0), (0.5, 1.0))] * 3, 0.1, 0.85, 0.97),
         # Hidden as often as in view, and in view just now.
         (([HIDDEN] * 10 + [IN_VIEW] * 10) * 3, 0.1, 0.9, 0.98),
         (([HIDDEN] * 10 + [IN_VIEW] * 10) * 3, 5.0, 0.3, 0.8),
