@@ -169,7 +169,9 @@ class TrackMoves(TrackIntake):
         return widened
 
     def _noises(self, estimate: Estimate, t_s: float) -> tuple[Noise, Noise]:
-        gyro, accel, push, rate, wander = estimate.walking.densities.tolist()
+        # What a pass over a dive that is over is given is cautious already.
+        walking = estimate.walking.cautious() if estimate.learns else estimate.walking
+        gyro, accel, push, rate, wander = walking.densities.tolist()
         if self.guessed is not None:
             push, *rates = self.guessed.at(t_s).tolist()
         else:

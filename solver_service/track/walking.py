@@ -36,7 +36,7 @@ WALKS: Final = len(FIRST)
 OF_UNITS: Final = slice(0, 2)
 OF_NODES: Final = slice(2, WALKS)
 # Seconds of light tell a bias's walk to a factor of three, and too small a walk makes seconds without light look known.
-# So what is taken for a whole dive is so many sigmas above what was learned, but no more than the first value.
+# So what is taken is so many sigmas above what was learned, but no more than the first value.
 CAUTIOUS_SIGMAS: Final = 2.0
 _BIASES: Final = (GYRO_BIAS, ACCEL_BIAS)
 
@@ -113,7 +113,9 @@ class Walking:
 
         With D = dP / dlog, G = H D H^T, u = dx / dlog and z = S^-1 y the likelihood's slope is
         (z^T G z - tr(S^-1 G)) / 2 + z^T H u, its information tr(S^-1 G S^-1 G) / 2 + u^T H^T S^-1 H u. After the
-        update u = (I - K H)(u + D H^T z), D = (I - K H) D (I - K H)^T. learns: whether the logs change.
+        update u = (I - K H)(u + D H^T z), D = (I - K H) D (I - K H)^T. learns: whether the logs change. The slope is
+        that at the walks that were taken, which are `cautious`: at the logs it is larger by the information times the
+        difference.
         """
         z = S_inverse @ y
         chi2 = float(y @ z)
@@ -137,6 +139,8 @@ class Walking:
         information = self.information.copy()
         information[at] += fisher + y_moved.T @ S_inverse @ y_moved
         step = np.zeros(WALKS)
+        above = (self.cautious().logs - self.logs)[self.followed]
+        slope = slope + (information - self.information)[at] @ above
         step[self.followed] = np.linalg.solve(information[at], slope)
         step = np.minimum(np.maximum(step, -LONGEST_STEP), LONGEST_STEP)
         logs = np.minimum(np.maximum(self.logs + step, LEAST), MOST)

@@ -9,6 +9,7 @@ import pytest
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.anchors import kalman
 from buddyline.solver_service.track.estimate import Estimate
+from buddyline.solver_service.track.moving import TrackMoves
 from buddyline.solver_service.track.state import ACCEL_BIAS, GYRO_BIAS, MOUNT, MOVING, PHI, SHAKE, SIZE, V_, State
 from buddyline.solver_service.track.stepping import TrackSteps
 from buddyline.solver_service.track.strapdown import (
@@ -21,6 +22,8 @@ from buddyline.solver_service.track.strapdown import (
     propagate,
 )
 from buddyline.solver_service.track.walking import FIRST, LEAST, OF_NODES, WALKS, Walking, joint
+
+from tests.solver_service.track.dives import Setting, make
 
 STEP_S = 0.1
 STILL = np.zeros((MOVING, MOVING))
@@ -56,7 +59,7 @@ def followed(walking: Walking, seen: Floats, noise: Floats, *, learns: bool) -> 
     x, P = np.zeros(SIZE), np.eye(SIZE) * 1e-6
     for y in seen:
         x = np.concatenate((F @ x, x[MOVING:]))
-        walk = walk_of(walking)
+        walk = walk_of(walking.cautious() if learns else walking)
         P = predicted(P, F, STILL, walk)
         walking = walking.stepped(F, walk, (True, True))
         error, P, _, inverse, gain = kalman(P, H, y - H @ x, noise)
@@ -107,6 +110,19 @@ def test_a_small_walk_that_little_light_has_told_is_taken_to_be_larger(told: flo
     assert (cautious.logs[2:] == logs[2:]).all()
     larger = replace(Walking(), logs=Walking().logs + 1.0, information=information)
     assert (larger.cautious().logs == larger.logs).all()
+
+
+@pytest.mark.parametrize("learns", [True, False])
+def test_what_little_light_has_told_of_a_walk_is_not_believed_in_darkness_live(*, learns: bool) -> None:
+    """A pass over a dive that is over is given a walk that is cautious already."""
+    a, b = make(1, Setting(seconds=1.0)).records
+    moves = TrackMoves((a.node, b.node))
+    estimate = Estimate(0.5, at_rest(), np.eye(SIZE), 0.5, learns=learns)
+    small = Walking(Walking().logs - 3.0)
+    estimate.walking = small
+    taken = small.cautious() if learns else small
+    for noise in moves._noises(estimate, 0.5):
+        assert (noise.gyro_bias_radps, noise.accel_bias_mps2) == pytest.approx(taken.densities[:2].tolist())
 
 
 def test_a_node_without_a_unit_tells_nothing_of_its_biases() -> None:
