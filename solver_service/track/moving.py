@@ -170,8 +170,8 @@ class TrackMoves(TrackIntake):
 
     def _noises(self, estimate: Estimate, t_s: float) -> tuple[Noise, Noise]:
         # What a pass over a dive that is over is given is cautious already.
-        walking = estimate.walking.cautious() if estimate.learns else estimate.walking
-        gyro, accel, push, rate, wander = walking.densities.tolist()
+        logs = estimate.walking.cautious_logs if estimate.learns else estimate.walking.logs
+        gyro, accel, push, rate, wander = np.exp(0.5 * logs).tolist()
         if self.guessed is not None:
             push, *rates = self.guessed.at(t_s).tolist()
         else:

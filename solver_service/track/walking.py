@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -26,6 +27,7 @@ from buddyline.solver_service.track.state import ACCEL_BIAS, GYRO_BIAS, MOVING, 
 # By FIRST_INFORMATION, 1 sd of a bias's walk is a factor of e; the others count as much as seconds of pictures tell, so
 # that a dive's first motion is not taken for all of it.
 FIRST: Final = np.array((5e-4, 8e-3, 0.3, 0.15, 1.0))
+FIRST_LOGS: Final = 2.0 * np.log(FIRST)
 FIRST_INFORMATION: Final = np.diag((0.25, 0.25, 30.0, 30.0, 30.0))
 # A calm diver may swim off or look away, and without a unit nothing tells it at once: so no walk is taken below this
 # share of its first value, that of the turn rate not below the value itself. With less, tracks were wrong while a node
@@ -49,7 +51,7 @@ class Walking:
     (SIZE, K): derivatives of the track's covariance and state by the logs that are followed.
     """
 
-    logs: Floats = field(default_factory=lambda: 2.0 * np.log(FIRST))
+    logs: Floats = field(default_factory=FIRST_LOGS.copy)
     information: Floats = field(default_factory=FIRST_INFORMATION.copy)
     followed: slice = field(default_factory=lambda: OF_UNITS)
     spread: Floats = field(default_factory=lambda: np.zeros((2, SIZE, SIZE)))
@@ -60,13 +62,16 @@ class Walking:
         """Densities per root s, as FIRST has them."""
         return np.asarray(np.exp(0.5 * self.logs))
 
+    @cached_property
+    def cautious_logs(self) -> Floats:
+        """The logs, those of units CAUTIOUS_SIGMAS above what was learned, but not above their first values."""
+        learned, variances = self.logs[OF_UNITS], np.linalg.inv(self.information).diagonal()[OF_UNITS]
+        raised = np.minimum(learned + CAUTIOUS_SIGMAS * np.sqrt(variances), FIRST_LOGS[OF_UNITS])
+        return np.concatenate((np.maximum(learned, raised), self.logs[OF_NODES]))
+
     def cautious(self) -> Walking:
-        """Give walks of units CAUTIOUS_SIGMAS above what was learned, but not above their first values."""
-        logs, sigmas = self.logs.copy(), np.sqrt(np.diag(np.linalg.inv(self.information)))
-        first = 2.0 * np.log(FIRST[OF_UNITS])
-        raised = np.minimum(logs[OF_UNITS] + CAUTIOUS_SIGMAS * sigmas[OF_UNITS], first)
-        logs[OF_UNITS] = np.maximum(logs[OF_UNITS], raised)
-        return replace(self, logs=logs)
+        """Give the walks of `cautious_logs`."""
+        return replace(self, logs=self.cautious_logs)
 
     def following(self, walking: tuple[bool, bool]) -> Walking:
         """Follow the walks that there are if these nodes have a unit; where others were followed, begin at 0."""
@@ -114,8 +119,7 @@ class Walking:
         With D = dP / dlog, G = H D H^T, u = dx / dlog and z = S^-1 y the likelihood's slope is
         (z^T G z - tr(S^-1 G)) / 2 + z^T H u, its information tr(S^-1 G S^-1 G) / 2 + u^T H^T S^-1 H u. After the
         update u = (I - K H)(u + D H^T z), D = (I - K H) D (I - K H)^T. learns: whether the logs change. The slope is
-        that at the walks that were taken, which are `cautious`: at the logs it is larger by the information times the
-        difference.
+        that at `cautious_logs`, which were taken: at the logs it is larger by the information times the difference.
         """
         z = S_inverse @ y
         chi2 = float(y @ z)
@@ -139,7 +143,7 @@ class Walking:
         information = self.information.copy()
         information[at] += fisher + y_moved.T @ S_inverse @ y_moved
         step = np.zeros(WALKS)
-        above = (self.cautious().logs - self.logs)[self.followed]
+        above = (self.cautious_logs - self.logs)[self.followed]
         slope = slope + (information - self.information)[at] @ above
         step[self.followed] = np.linalg.solve(information[at], slope)
         step = np.minimum(np.maximum(step, -LONGEST_STEP), LONGEST_STEP)
