@@ -20,7 +20,7 @@ import sys
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 from unittest.mock import patch
 
@@ -132,7 +132,7 @@ def told(grade: Grade) -> Iterator[None]:
 
     def noise(self: Samples, time_s: float) -> Noise:
         gyro, accel = WALKED * grade.gyro_walk_radps, WALKED * grade.accel_walk_mps2
-        return replace(sampled(self, time_s), gyro_bias_radps=gyro, accel_bias_mps2=accel)
+        return sampled(self, time_s)._replace(gyro_bias_radps=gyro, accel_bias_mps2=accel)
 
     sampled = Samples.noise
     least_s, most_s = (ns * 1e-9 for ns in grade.delay_ns)

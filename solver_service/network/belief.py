@@ -222,13 +222,13 @@ class NetBelief:
         noise = self.intake.samples[member.node].noise(t_s)
         if self.walked != 1.0:
             gyro, accel = self.walked * noise.gyro_bias_radps, self.walked * noise.accel_bias_mps2
-            noise = replace(noise, gyro_bias_radps=gyro, accel_bias_mps2=accel)
+            noise = noise._replace(gyro_bias_radps=gyro, accel_bias_mps2=accel)
         if member.looks_away:
-            noise = replace(noise, gap_rate_radps=max(noise.gap_rate_radps, AWAY_RATE))
+            noise = noise._replace(gap_rate_radps=max(noise.gap_rate_radps, AWAY_RATE))
         stated = self.intake.turning[member.node].stated(t_s)
         if stated is None:
             return noise
-        return replace(noise, gap_tilt_rad=WANDER * stated[0], gap_heading_rad=WANDER * stated[1])
+        return noise._replace(gap_tilt_rad=WANDER * stated[0], gap_heading_rad=WANDER * stated[1])
 
     @property
     def _moving(self) -> list[int]:
@@ -252,7 +252,7 @@ class NetBelief:
             turned = self._turned_suddenly(moving, after, step[0], step[1], to_s)
             if any(turned):
                 noises = [
-                    replace(noise, gap_rate_radps=max(noise.gap_rate_radps, rate))
+                    noise._replace(gap_rate_radps=max(noise.gap_rate_radps, rate))
                     for noise, rate in zip(noises, turned, strict=True)
                 ]
                 after, *step = moved_members(of_moving, parts, noises, shaking, to_s - self.t_s)

@@ -135,7 +135,7 @@ class NetEstimate(NetBelief):
         which = columns(observers, others)
         P = with_stamp(self.covariance[which[:, :, None], which[:, None, :]])
         first = D[:, 0, 0]
-        spread_m2 = np.trace(first @ P @ np.swapaxes(first, 1, 2), axis1=1, axis2=2)
+        spread_m2 = np.trace(first @ P @ first.swapaxes(1, 2), axis1=1, axis2=2)
         wide = spread_m2 > 0.01 * (X[:, 0, 0] ** 2).sum(axis=1)
         if wide.any() and len(seen) > 1:
             # Where little is known, the second picture's lights are linear only about where the first one's put them.

@@ -81,7 +81,7 @@ class Move:
             return whole
         n = len(self.F)
         moved = M.copy()
-        moved[1:] = (np.swapaxes(self.F, 1, 2) @ M[1:].reshape(n, BLOCK, -1)).reshape(n * BLOCK, -1)
+        moved[1:] = (self.F.swapaxes(1, 2) @ M[1:].reshape(n, BLOCK, -1)).reshape(n * BLOCK, -1)
         return moved
 
     def covariance(self, P: Floats) -> Floats:
@@ -90,7 +90,7 @@ class Move:
         after = P.copy()
         after[1:] = (self.F @ P[1:].reshape(n, BLOCK, -1)).reshape(n * BLOCK, -1)
         after[:, 1:] = (
-            (np.swapaxes(after[:, 1:].reshape(-1, n, BLOCK), 0, 1) @ np.swapaxes(self.F, 1, 2))
+            (np.swapaxes(after[:, 1:].reshape(-1, n, BLOCK), 0, 1) @ self.F.swapaxes(1, 2))
             .swapaxes(0, 1)
             .reshape(-1, n * BLOCK)
         )
@@ -142,7 +142,7 @@ def moved_members(
     moved[:, PHI, SHAKE] = felt[:, :, None] * (R0 - kept[:, :, None] * R)
     moved[:, :, :MOVING] = moved[:, :, :MOVING] @ plain_of_own(p, v, shove)
     own = own_of_plain(after.p_m, after.v_mps, after.shove_mps)
-    own_back = np.swapaxes(own, 1, 2)
+    own_back = own.swapaxes(1, 2)
     F, Q = np.tile(np.eye(BLOCK), (len(state), 1, 1)), np.zeros((len(state), BLOCK, BLOCK))
     F[:, :MOVING] = own @ moved
     shaken = shaking[:, :, None, None] * shaking_parts(R, span)

@@ -79,7 +79,7 @@ def make_rows(due: Sequence[DueNetRow]) -> list[NetRow]:
         begin = np.cumsum([0, *(len(of.state) for of in some)])
         state, F, Q = _moved(some, begin)
         P = np.array([of.covariance[block(i), block(i)] for of in some for i in range(len(of.state))])
-        own = F @ P @ np.swapaxes(F, 1, 2) + Q
+        own = F @ P @ F.swapaxes(1, 2) + Q
         if some[0].anchor is not None:
             state, own = _beside_anchors(some, begin, state, F, own)
         stamps_ns = [of.stamp_ns for of in some for _ in of.members]
@@ -126,15 +126,15 @@ def _beside_anchors(
     counts = [len(of.state) for of in due]
     ref = np.repeat([int(first) + (of.anchor or 0) for of, first in zip(due, begin, strict=False)], counts)
     with_ref = np.array([of.covariance[block(i), block(of.anchor or 0)] for of in due for i in range(len(of.state))])
-    C = F @ with_ref @ np.swapaxes(F[ref], 1, 2)
+    C = F @ with_ref @ F[ref].swapaxes(1, 2)
     C[np.unique(ref)] = own[np.unique(ref)]
     p, v = state.p_m[ref], state.v_mps[ref]
     J = plain_of_posed(p, v)
     G = J.copy()
     G[:, PHI] = 0.0
-    J_back, G_back = np.swapaxes(J, 1, 2), np.swapaxes(G, 1, 2)
+    J_back, G_back = J.swapaxes(1, 2), G.swapaxes(1, 2)
     across = J @ C @ G_back
-    own = J @ own @ J_back - across - np.swapaxes(across, 1, 2) + G @ own[ref] @ G_back
+    own = J @ own @ J_back - across - across.swapaxes(1, 2) + G @ own[ref] @ G_back
     return replace(state, p_m=state.p_m - p, v_mps=state.v_mps - v), own
 
 
@@ -147,7 +147,7 @@ def rows_of(
     about the vertical besides. Whether a place is known well is asked without it.
     """
     J = plain_of_posed(state.p_m, state.v_mps)
-    plain = J @ own @ np.swapaxes(J, 1, 2)
+    plain = J @ own @ J.swapaxes(1, 2)
     sigma_m = np.sqrt(np.maximum(np.trace(plain[:, P_, P_], axis1=1, axis2=2), 0.0))
     known = sigma_m < np.maximum(TOLD_M, TOLD_SHARE * np.sqrt(inner(state.p_m, state.p_m)))
     pose = np.r_[P_, PHI]

@@ -67,7 +67,7 @@ class NetShaking:
     def moved(self, F: Floats, drawn: Floats) -> NetShaking:
         """Go on by a step of the members: F (n, MOVING, MOVING), and what it adds, (n, 2, MOVING, MOVING)."""
         onward = F[:, None]
-        return NetShaking(self.logs, self.information, onward @ self.parts @ np.swapaxes(onward, -1, -2) + drawn)
+        return NetShaking(self.logs, self.information, onward @ self.parts @ onward.swapaxes(-1, -2) + drawn)
 
     def taught(self, y: Floats, S_inverse: Floats, H: Floats, gain: Floats) -> NetShaking:
         """Go on by one picture's residuals y (m,), H (m, N), by Fisher's scoring (Shaking.taught).
@@ -79,7 +79,7 @@ class NetShaking:
         """
         n, m = len(self.logs), len(y)
         H_own = np.swapaxes(H[:, 1:].reshape(m, n, -1), 0, 1)[:, :, :MOVING]
-        D = (H_own[:, None] @ self.parts @ np.swapaxes(H_own, 1, 2)[:, None]).reshape(2 * n, m, m)
+        D = (H_own[:, None] @ self.parts @ H_own.swapaxes(1, 2)[:, None]).reshape(2 * n, m, m)
         W = S_inverse @ D
         rank = np.repeat(np.clip(H_own.any(axis=2).sum(axis=1), 1, MOVING), 2)
         share = np.trace(W, axis1=1, axis2=2) / rank
@@ -88,11 +88,11 @@ class NetShaking:
         z = S_inverse @ y
         z = z * math.sqrt(min(1.0, MOST_CHI2 * m / max(float(y @ z), 1e-9)))
         slope = 0.5 * (D @ z @ z - np.trace(W, axis1=1, axis2=2))
-        fisher = 0.5 * (W.reshape(2 * n, -1) @ np.swapaxes(W, 1, 2).reshape(2 * n, -1).T)
+        fisher = 0.5 * (W.reshape(2 * n, -1) @ W.swapaxes(1, 2).reshape(2 * n, -1).T)
         kept, first = 0.5 ** (1.0 / (HALVED * n)), np.tile(_FIRST, n)
         logs, information = learned(self.logs.ravel(), self.information, slope, fisher, first, kept)
         rest = (np.eye(MOVING) - gain[1:].reshape(n, -1, m)[:, :MOVING] @ H_own)[:, None]
-        parts = rest @ own @ np.swapaxes(rest, -1, -2)
+        parts = rest @ own @ rest.swapaxes(-1, -2)
         return NetShaking(np.clip(logs.reshape(n, 2), *_BOUNDS), information, parts)
 
 
@@ -107,7 +107,7 @@ def shaking_parts(R: Floats, span_s: Floats) -> Floats:
     angle, velocity = out[:, 0], out[:, 1]
     angle[:, PHI, PHI] = angle[:, SHAKE, SHAKE] = fresh
     angle[:, PHI, SHAKE] = -fresh @ R
-    angle[:, SHAKE, PHI] = np.swapaxes(angle[:, PHI, SHAKE], 1, 2)
+    angle[:, SHAKE, PHI] = angle[:, PHI, SHAKE].swapaxes(1, 2)
     velocity[:, V_, V_] = velocity[:, SHOVE, SHOVE] = fresh
     velocity[:, V_, SHOVE] = velocity[:, SHOVE, V_] = -fresh
     velocity[:, P_, V_] = velocity[:, V_, P_] = both

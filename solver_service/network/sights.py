@@ -42,9 +42,9 @@ def light_positions(
     i, j = list(observers), list(others)
     ahead = times_s + (state.clock_s[j] - state.clock_s[i])[:, None]  # (B, T)
     R_observer = state.R[i][:, None] @ turns_over(rates_radps[i], times_s)
-    toward = np.swapaxes(R_observer, -1, -2)[:, :, None]  # (B, T, 1, 3, 3)
+    toward = R_observer.swapaxes(-1, -2)[:, :, None]  # (B, T, 1, 3, 3)
     R_other = state.R[j][:, None] @ turns_over(rates_radps[j], ahead)
-    v_mps, lamps = state.v_mps[j][:, None], np.swapaxes(lights_m, 1, 2)
+    v_mps, lamps = state.v_mps[j][:, None], lights_m.swapaxes(1, 2)
     arms = np.swapaxes(R_other @ lamps[:, None], -1, -2)  # (B, T, L, 3)
     swept = np.swapaxes(R_other @ (skew(rates_radps[j]) @ lamps)[:, None], -1, -2)
     a = (state.p_m[j][:, None] + ahead[..., None] * v_mps)[:, :, None] + arms

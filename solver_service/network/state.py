@@ -104,7 +104,7 @@ class NetState:
     def minus(self, other: NetState) -> Floats:
         """Return the error (1 + 30 n,) by which this state is off another: other.plus(error) is this one."""
         e = np.empty((len(self), BLOCK))
-        e[:, PHI] = phi = rotation_log(self.R @ np.swapaxes(other.R, 1, 2))
+        e[:, PHI] = phi = rotation_log(self.R @ other.R.swapaxes(1, 2))
         turn = rotation_exp(phi)
         e[:, P_] = self.p_m - _turned(turn, other.p_m)
         e[:, V_] = self.v_mps - _turned(turn, other.v_mps)

@@ -124,7 +124,7 @@ class Told:
         error[posed] = self.covariance @ mu
         own = self.covariance.reshape(n, POSED, -1)
         prior = np.stack([own[i][:, block(i)][:, :POSED] for i in range(n)])
-        return self.state.plus(error), prior - own @ L @ np.swapaxes(own, 1, 2)
+        return self.state.plus(error), prior - own @ L @ own.swapaxes(1, 2)
 
 
 Event: TypeAlias = Moved | Learned | Grown | Chosen | Told

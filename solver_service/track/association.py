@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from itertools import chain, islice
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from buddyline.solver_service.geometry.evidence import GROSS_PX, GROSS_SHARE
@@ -31,8 +30,7 @@ Case: TypeAlias = tuple[tuple[int, int] | None, tuple[int, int] | None]
 _Option: TypeAlias = tuple[float, int, int]
 
 
-@dataclass(frozen=True, eq=False)
-class Association:
+class Association(NamedTuple):
     """What one picture says of the lights.
 
     chosen: (candidate, light, variance in px^2) of those that are sure or likely; the variance is that of the mixture
@@ -47,8 +45,7 @@ class Association:
     ambiguous: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class Odds:
+class Odds(NamedTuple):
     """Every assignment of one picture's candidates, and the logs (N,) of their densities over clutter.
 
     How likely each light is found is left out: that is learned from picture to picture. y_px (K, 2, 2): how far each
@@ -64,7 +61,7 @@ class Odds:
     def times(self, logs: Floats) -> Odds:
         """Give the odds where each candidate (K) is each light with odds that differ by these logs (K, 2)."""
         more = [sum(logs[one[0], light] for light, one in enumerate(case) if one is not None) for case in self.cases]
-        return replace(self, logs=self.logs + more)
+        return self._replace(logs=self.logs + more)
 
     def weighed(self, detection: Floats, within: Floats = IN_PICTURE) -> tuple[list[Case], Floats]:
         """Give the assignments and the logs of their odds.
@@ -192,7 +189,7 @@ def _single(
 
     Of each the log of the density over clutter, the candidate, and its mode: 1 where it is off by a gross error.
     """
-    S = (H @ P[:, None, None] @ np.swapaxes(H, -1, -2))[:, None]  # (N, 1, K, 2, 2, 2)
+    S = (H @ P[:, None, None] @ H.swapaxes(-1, -2))[:, None]  # (N, 1, K, 2, 2, 2)
     a, b, c = S[..., 0, 0] + variances[..., None], S[..., 0, 1], S[..., 1, 1] + variances[..., None]
     u, v = y[:, None, ..., 0], y[:, None, ..., 1]
     det = a * c - b * b
@@ -223,7 +220,7 @@ def _both(
     k, mode, light, of = pairs[:, :, 0], pairs[:, :, 1], np.array((0, 1)), at[:, None]
     H_both = H[of, k, light].reshape(len(pairs), 4, -1)
     y_both = y[of, k, light].reshape(len(pairs), 4)
-    S = H_both @ P[at] @ np.swapaxes(H_both, 1, 2)
+    S = H_both @ P[at] @ H_both.swapaxes(1, 2)
     S[:, range(4), range(4)] += np.repeat(variances[of, mode, k], 2, axis=1)
     chi2 = (y_both * np.linalg.solve(S, y_both[..., None])[..., 0]).sum(axis=1)
     logs = -0.5 * (chi2 + np.linalg.slogdet(S)[1]) + _LOG_SHARES[mode].sum(axis=1) - 2.0 * log_clutter[at]

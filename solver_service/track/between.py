@@ -53,10 +53,10 @@ def _rows_together(
         P = _mixed(share, path.covariance(one), path.covariance(two))
     else:
         by_one, by_two = weights.jacobians(before, after, between)
-        across = by_one @ path.across[two] @ np.swapaxes(by_two, 1, 2)
-        P = across + np.swapaxes(across, 1, 2)
+        across = by_one @ path.across[two] @ by_two.swapaxes(1, 2)
+        P = across + across.swapaxes(1, 2)
         for J, k in ((by_one, one), (by_two, two)):
-            P += J @ path.covariance(k) @ np.swapaxes(J, 1, 2)
+            P += J @ path.covariance(k) @ J.swapaxes(1, 2)
     if gap:
         P = with_gap(P, gap, by_gap, between)
     near = np.where(share < 1.0, one, two)
@@ -108,7 +108,7 @@ class Weights:
         r = before.r_m + self.end[:, None] * (after.r_m - before.r_m)
         r += self.slopes[0, :, None] * before.v_mps + self.slopes[1, :, None] * after.v_mps
         v = before.v_mps + self.share[:, None] * (after.v_mps - before.v_mps)
-        turn = self.turned[:, None, None] * rotation_log(np.swapaxes(before.R, -1, -2) @ after.R)
+        turn = self.turned[:, None, None] * rotation_log(before.R.swapaxes(-1, -2) @ after.R)
         turn += self.rated[0, :, None, None] * rates_before + self.rated[1, :, None, None] * rates_after
         return before.moved(r, v, before.R @ rotation_exp(turn))
 
@@ -155,5 +155,5 @@ def _unseen(path: Path, states: State, two: NDArray[np.intp], span_s: Floats, we
     variances[:, R_] = walked * (span_s**2)[:, None] * left**3 / 3.0
     T = invariant_of_plain(states)[:, :NAV, :NAV]
     out = np.zeros((len(two), len(COLUMNS), len(COLUMNS)))
-    out[:, :NAV, :NAV] = (T * variances[:, None, :]) @ np.swapaxes(T, -1, -2)
+    out[:, :NAV, :NAV] = (T * variances[:, None, :]) @ T.swapaxes(-1, -2)
     return out

@@ -71,10 +71,10 @@ def course_of(samples: Samples, times_s: Floats, node: TrackNode, own: Floats) -
     a = a - D @ lever_m
     at = np.searchsorted(grid, times_s).clip(1, len(grid) - 1)
     share = ((times_s - grid[at - 1]) / (grid[at] - grid[at - 1]))[:, None]
-    step = rotation_log(np.swapaxes(D[0, at - 1], 1, 2) @ D[0, at])
+    step = rotation_log(D[0, at - 1].swapaxes(1, 2) @ D[0, at])
     D_at = D[:, at - 1] @ rotation_exp(share * step)
     a_at = (1.0 - share) * a[:, at - 1] + share * a[:, at]
-    turned = rotation_log((np.swapaxes(D_at[:1], -1, -2) @ D_at[1:]).reshape(-1, 3, 3)).reshape(15, -1, 3)
+    turned = rotation_log((D_at[:1].swapaxes(-1, -2) @ D_at[1:]).reshape(-1, 3, 3)).reshape(15, -1, 3)
     G = np.moveaxis(turned / small[:, None, None], 0, -1)
     A = np.moveaxis((a_at[1:] - a_at[0]) / small[:, None, None], 0, -1)
     # The shaking's part is no motion: rates are means over some tenths of a second.

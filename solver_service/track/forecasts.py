@@ -134,7 +134,7 @@ def _block_after(P: Floats, F: Floats, Q: Floats, walk: Floats) -> Floats:
     onward = F[..., :NAV, :]
     across = onward @ P
     after = np.empty((*P.shape[:-2], NAV + 1, NAV + 1))
-    after[..., :NAV, :NAV] = across @ np.swapaxes(onward, -1, -2) + Q[..., :NAV, :NAV]
+    after[..., :NAV, :NAV] = across @ onward.swapaxes(-1, -2) + Q[..., :NAV, :NAV]
     after[..., :NAV, NAV] = after[..., NAV, :NAV] = across[..., CLOCK]
     after[..., NAV, NAV] = P[..., CLOCK, CLOCK] + walk[..., CLOCK - MOVING]
     return after

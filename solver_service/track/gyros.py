@@ -129,7 +129,7 @@ def turns_of(told: TurningTold) -> Turns | None:
     if len(t) < 2 or t[-1] - t[0] < TURN_S + MEAN_S:
         return None
     # Turned angles in the body frame, summed axis by axis, of attitudes and of the gyro alike.
-    shown = _summed(small_log(np.swapaxes(R[:-1], 1, 2) @ R[1:]))
+    shown = _summed(small_log(R[:-1].swapaxes(1, 2) @ R[1:]))
     steps_s = np.diff(gyro_s)
     sums = _summed(0.5 * (rate_radps[1:] + rate_radps[:-1]) * steps_s[:, None])
     after = np.searchsorted(gyro_s, t)
@@ -170,7 +170,7 @@ def gyro_fault(turns: Turns) -> GyroFault:
     sound = _chi2(turns, turns.attitude_rad - turns.gyro_rad)
     sound = sound[sound.sum(axis=1).argmin()]
     # Each turn's chi^2 for each fault (H, K), and all turns'.
-    each = _chi2(turns, turns.attitude_rad - turns.gyro_rad[0] @ np.swapaxes(faults, 1, 2))
+    each = _chi2(turns, turns.attitude_rad - turns.gyro_rad[0] @ faults.swapaxes(1, 2))
     chi2 = each.sum(axis=1)
     # Rolling and pitching alone.
     shown, turned = (

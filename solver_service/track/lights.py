@@ -56,7 +56,7 @@ def light_positions(
     r = (r_m + ahead_s[..., None] * v_mps)[..., None, :]
     sign = 1.0 if observer == 0 else -1.0
     d = sign * r + arms
-    toward = np.swapaxes(R_observer, -1, -2)[..., None, :, :]  # (T, 1, 3, 3)
+    toward = R_observer.swapaxes(-1, -2)[..., None, :, :]  # (T, 1, 3, 3)
     X = (toward @ d[..., None])[..., 0]
     D = np.zeros((*X.shape, NAV + 2))
     D[..., 0:3] = sign * toward
@@ -94,7 +94,7 @@ def residuals(bearings: Floats, tangents: Floats, X: Floats, D: Floats) -> tuple
     depth = (X @ bearings[..., None])[..., 0]
     ahead = depth > 1e-3 * np.sqrt((X * X).sum(-1))
     safe = np.where(ahead, depth, 1.0)
-    h = X @ np.swapaxes(tangents, -1, -2) / safe[..., None]
+    h = X @ tangents.swapaxes(-1, -2) / safe[..., None]
     slope = (tangents[..., None, :, :] - h[..., None] * bearings[..., None, None, :]) / safe[..., None, None]
     H = slope @ D
     y = np.where(ahead[..., None], -h, np.inf)
@@ -145,7 +145,7 @@ def share_before(
     if at is None:
         return 0.0, np.zeros(len(y))
     J = camera.rays(at[None])[1][0] @ D / np.linalg.norm(X)
-    across, of_all = P @ np.swapaxes(H, 1, 2), P @ J.T
+    across, of_all = P @ H.swapaxes(1, 2), P @ J.T
     S = H @ across + sigma_px[:, None, None] ** 2 * np.eye(2)
     gain = np.swapaxes(np.linalg.solve(S, H @ of_all), 1, 2)
     moved = (gain @ np.where(np.isfinite(y), y, 0.0)[..., None])[..., 0]

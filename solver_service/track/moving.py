@@ -179,13 +179,13 @@ class TrackMoves(TrackIntake):
         noises = []
         for node in (0, 1):
             noise = self.samples[node].noise(t_s).scaled(self.unrest)
-            noise = replace(noise, gyro_bias_radps=gyro, accel_bias_mps2=accel)
+            noise = noise._replace(gyro_bias_radps=gyro, accel_bias_mps2=accel)
             if estimate.without[node]:
-                noise = replace(noise, gap_accel_mps=push, gap_rate_radps=rates[node])
+                noise = noise._replace(gap_accel_mps=push, gap_rate_radps=rates[node])
                 stated = self.turning[node].stated(t_s)
                 if stated is not None:
                     tilt, heading = stated
-                    noise = replace(noise, tilt_rad=tilt, gap_tilt_rad=wander * tilt, gap_heading_rad=wander * heading)
+                    noise = noise._replace(tilt_rad=tilt, gap_tilt_rad=wander * tilt, gap_heading_rad=wander * heading)
             noises.append(noise)
         return noises[0], noises[1]
 
@@ -290,7 +290,7 @@ class TrackMoves(TrackIntake):
         S = H @ estimate.covariance @ H.T + np.diag(np.square(walks) * span_s)
         S += noise.gap_rate_radps**2 * span_s**3 / 3.0 * np.eye(3) + (R_level_camera * variances) @ R_level_camera.T
         rate, estimate.turning_off[node] = sudden_rate(y, S, estimate.turning_off[node], span_s)
-        return replace(noise, gap_rate_radps=max(noise.gap_rate_radps, rate))
+        return noise._replace(gap_rate_radps=max(noise.gap_rate_radps, rate))
 
     def _predict(self, estimate: Estimate, t_s: float) -> tuple[State, Floats]:
         """Return state and covariance at t_s, within TOGETHER_S those of now."""

@@ -77,7 +77,7 @@ def pose_jacobian(now: State) -> Floats:
 
     With psi = phi_B - phi_A, t = R_A^T r errs by dt = R_A^T (dr - [r]x psi), and w = R_A^T psi.
     """
-    toward = np.swapaxes(now.R[..., 0, :, :], -1, -2)
+    toward = now.R[..., 0, :, :].swapaxes(-1, -2)
     J = np.zeros((*toward.shape[:-2], 12, NAV))
     J[..., 0:3, R_] = toward
     across = skew(now.r_m)
@@ -115,7 +115,7 @@ def _bent(C: Floats) -> Floats:
     # By j, k, m, n; both again with its two axes at j and n, and at m and k.
     fourth = both[:, :, :, None, None] * both[:, None, None, :, :]
     fourth += of_w[:, :, None, :, None] * of_t[:, None, :, None, :]
-    fourth += both[:, :, None, None, :] * np.swapaxes(both, 1, 2)[:, None, :, :, None]
+    fourth += both[:, :, None, None, :] * both.swapaxes(1, 2)[:, None, :, :, None]
     bent: Floats = 0.25 * (_ACROSS @ fourth.reshape(-1, 9, 9) @ _ACROSS.T)
     return bent
 
@@ -134,9 +134,9 @@ def rows_of(
     nearest in time. Only what is told in north-east-down has their north_doubt: it turns all about the vertical.
     """
     now = at_one_time(states, rates_radps)
-    toward = np.swapaxes(now.R[:, 0], -1, -2)
+    toward = now.R[:, 0].swapaxes(-1, -2)
     J = pose_jacobian(now) @ at_one_time_jacobian(states, rates_radps)
-    whole = J @ P @ np.swapaxes(J, -1, -2)
+    whole = J @ P @ J.swapaxes(-1, -2)
     whole[:, :3, :3] += _bent(whole[:, :6, :6])
     ranges_m = np.sqrt(inner(now.r_m, now.r_m))
     lit_m = np.array([status.lit_m for status in statuses])

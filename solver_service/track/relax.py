@@ -143,7 +143,7 @@ class PathPass(TrackSteps):
         )
         self._path, self._k, self._off, self._keeps = path, 0, told.minus(first), keeps
         self._open(self.passed)
-        self.passed.steps.last = replace(self.passed.steps.last, before=self._off, after=self._off)
+        self.passed.steps.last = self.passed.steps.last._replace(before=self._off, after=self._off)
         # The shaking that a run's steps are worked out with.
         self._shaking = shaking.variances
 
@@ -281,8 +281,8 @@ class PathPass(TrackSteps):
                 main.chi2 += chi2
                 main.chi2_dof += len(y)
                 main.light_s = max(main.light_s, *(t_s for t_s, _, _ in lights))
-        return replace(
-            step, after=self._off, covariance=main.covariance, status=main.status, looks=(*step.looks, *looks)
+        return step._replace(
+            after=self._off, covariance=main.covariance, status=main.status, looks=(*step.looks, *looks)
         )
 
     def _associated(self, sight: Sight, by_path: BySight) -> Association:
@@ -302,7 +302,7 @@ class PathPass(TrackSteps):
         learn_found(main, observer, sight.t_s, detection, np.array(inside, float), found)
         if all(inside):
             self.lamps.take(1 - observer, sight.t_s, found.seen)
-        return replace(found, chosen=in_front(found.chosen, by_path.y))
+        return found._replace(chosen=in_front(found.chosen, by_path.y))
 
     def _apply(self, estimate: Estimate, H: Floats, y: Floats, noise: Floats) -> None:
         error, _ = told_by(estimate, H, y - H @ self._off, noise)

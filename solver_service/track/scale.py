@@ -89,7 +89,7 @@ def with_gap(P: Floats, share: float, U: Floats, state: State) -> Floats:
     """
     r_m = state.r_m
     toward = np.stack((r_m, -r_m), axis=-2)
-    sight = np.swapaxes(state.R, -1, -2) @ toward[..., None]
+    sight = state.R.swapaxes(-1, -2) @ toward[..., None]
     ahead = np.array((0.0, 0.0, 1.0))
     axis = np.cross(ahead, sight[..., 0])
     sine = np.maximum(np.linalg.norm(axis, axis=-1, keepdims=True), 1e-9)
@@ -100,5 +100,5 @@ def with_gap(P: Floats, share: float, U: Floats, state: State) -> Floats:
         plain[..., 1 + node, PHI[node]] = math.sqrt(0.5) * share * turns[..., node, :]
     moved = plain @ np.swapaxes(invariant_of_plain(state)[..., :NAV, :NAV], -1, -2)
     more = P + share**2 * np.outer(U, U)
-    more[..., :NAV, :NAV] += np.swapaxes(moved, -1, -2) @ moved
+    more[..., :NAV, :NAV] += moved.swapaxes(-1, -2) @ moved
     return more

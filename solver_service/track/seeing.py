@@ -145,7 +145,7 @@ class TrackSights(TrackMoves):
             y, H = self._about(estimate, sight, counted(found.chosen, sight, estimate), guide)
         # What another estimate chose may be behind the camera by this one.
         if len(chosen := in_front(found.chosen, y)) < len(found.chosen):
-            found = replace(found, chosen=chosen)
+            found = found._replace(chosen=chosen)
         estimate.trigger_lights = [seen for seen in estimate.trigger_lights if abs(sight.t_s - seen[0]) < ONE_TRIGGER_S]
         estimate.evidence += found.evidence
         estimate.evidence_by[observer] += found.evidence
@@ -159,8 +159,8 @@ class TrackSights(TrackMoves):
         if found.chosen:
             if not estimate.confirmed:
                 estimate.used[observer, sight.stamp_ns] = found.chosen
-                found = replace(found, chosen=_widened_lights(found.chosen, estimate, sight, H))
-            found = replace(found, chosen=self._update_lights(estimate, found, y, H, sight))
+                found = found._replace(chosen=_widened_lights(found.chosen, estimate, sight, H))
+            found = found._replace(chosen=self._update_lights(estimate, found, y, H, sight))
             if estimate.unseen_by == observer:
                 estimate.unseen_by = None
             if len(found.chosen) == 2:
@@ -216,17 +216,17 @@ class TrackSights(TrackMoves):
         for n, left in kept:
             H_used[n, : len(left.y), :-1], y_used[n, : len(left.y)] = left.H, left.y
         H_used, late = H_used[..., :-1], STAMP_SIGMA_S * H_used[..., -1:]
-        across = P @ np.swapaxes(H_used, 1, 2)
-        rest = R[:, :, None] * np.eye(4) + late * np.swapaxes(late, 1, 2) - H_used @ across
+        across = P @ H_used.swapaxes(1, 2)
+        rest = R[:, :, None] * np.eye(4) + late * late.swapaxes(1, 2) - H_used @ across
         # No light leaves less than this share of its variance.
         least = np.full((len(seen), 1), LEAST_LEFT)
         for n, left in kept:
             rest[n, : len(left.y), : len(left.y)], least[n] = left.S, ROUNDING
         values, vectors = np.linalg.eigh(rest)
         values = np.maximum(values, least * np.where(H_used.any(axis=2), R, np.inf).min(axis=1, keepdims=True))
-        inverse = (vectors / values[:, None]) @ np.swapaxes(vectors, 1, 2)
+        inverse = (vectors / values[:, None]) @ vectors.swapaxes(1, 2)
         gain = across @ inverse
-        P = P + gain @ np.swapaxes(across, 1, 2)
+        P = P + gain @ across.swapaxes(1, 2)
         y_without = y + (H[..., :-1] @ (gain @ y_used[..., None])[:, None, None])[..., 0]
         # Candidates that a picture does not have are nowhere.
         y_without[~bearings.any(axis=2)] = np.inf
@@ -285,22 +285,22 @@ class TrackSights(TrackMoves):
         y: Floats,
         H: Floats,
         P: Floats,
-    ) -> tuple[Floats, Floats]:
+    ) -> tuple[Floats, Floats | None]:
         """Give how likely each light is within a picture, and log odds (K, 2) of its candidates, by the last picture.
 
         A light that was not seen there, and was in view, was outside. So it has come in since, or is outside still: it
         is hardly a candidate that stands where it would have been in the last picture, too. at: a state, its turn rates
         and the picture's time after it.
         """
-        missing, logs = estimate.missing[sight.node], np.zeros(y.shape[:2])
-        if not estimate.confirmed or not missing.any():
-            return within, logs
+        missing = estimate.missing[sight.node].tolist()
+        if not estimate.confirmed or not any(missing):
+            return within, None
         state, rates_radps, after_s = at
         camera, lights_m = self.nodes[sight.node].rig.camera, self.nodes[1 - sight.node].rig.lights_m
         then_s = np.array((after_s + estimate.shown_s[sight.node] - sight.t_s,))
         X, D = light_positions(state, sight.node, lights_m, rates_radps, then_s)
-        now = within.copy()
-        for light, c in enumerate(missing.tolist()):
+        now, logs = within.copy(), np.zeros(y.shape[:2])
+        for light, c in enumerate(missing):
             of_all = y[:, light], H[:, light], sight.sigma_px
             before, if_now = share_before(camera, X[0, light], D[0, light], P, EDGE_PX, *of_all)
             logs[:, light] = np.log((1.0 - c * if_now) / (1.0 - c * before))
@@ -375,8 +375,10 @@ def found_now(estimate: Estimate, observer: int, t_s: float) -> Floats:
     if not estimate.confirmed:
         return share.copy()
     kept = math.exp(-max(t_s - estimate.shown_s[observer], 0.0) / HIDDEN_S)
-    found = share + kept * (estimate.shown[observer] - share)
-    return np.where(share > 0.0, np.minimum(np.maximum(found, LEAST_FOUND), MOST_FOUND), 0.0)
+    both = zip(share.tolist(), estimate.shown[observer].tolist(), strict=True)
+    return np.array(
+        [min(max(lit + kept * (now - lit), LEAST_FOUND), MOST_FOUND) if lit > 0.0 else 0.0 for lit, now in both]
+    )
 
 
 def learn_found(
@@ -392,15 +394,15 @@ def learn_found(
     estimate.missing[observer, [light for _, light, _ in association.chosen]] = 0.0
     if association.ambiguous:
         return
-    seen = association.seen
-    for light in (0, 1):
-        share = estimate.detection[observer, light]
+    shares = estimate.detection[observer].tolist()
+    of_each = zip(shares, found.tolist(), within.tolist(), association.seen.tolist(), strict=True)
+    for light, (share, likely, inside, seen) in enumerate(of_each):
         if share > 0.0:
-            if within[light] > INSIDE:
-                share += 0.05 * (seen[light] - share)
-                estimate.detection[observer, light] = min(max(share, LEAST_FOUND), MOST_FOUND)
-            missing = found[light] * (1.0 - FOUND_IN_VIEW * within[light]) / (1.0 - found[light] * within[light])
-            estimate.shown[observer, light] = FOUND_IN_VIEW * seen[light] + (1.0 - seen[light]) * missing
+            if inside > INSIDE:
+                followed = share + 0.05 * (seen - share)
+                estimate.detection[observer, light] = min(max(followed, LEAST_FOUND), MOST_FOUND)
+            missing = likely * (1.0 - FOUND_IN_VIEW * inside) / (1.0 - likely * inside)
+            estimate.shown[observer, light] = FOUND_IN_VIEW * seen + (1.0 - seen) * missing
 
 
 def light_rows(chosen: Chosen, y: Floats, H: Floats) -> tuple[Floats, Floats, Floats]:
@@ -450,9 +452,9 @@ def noise_of(variances: Floats, by_time: Floats, pictures: NDArray[Any]) -> Floa
 
     variances (N,): px^2. by_time (N, 2): how they move in their pictures, px/s. pictures (N,): which one each is in.
     """
-    late, of = STAMP_SIGMA_S * by_time.ravel(), np.repeat(pictures, 2)
+    late, of = STAMP_SIGMA_S * by_time.ravel(), pictures.repeat(2)
     noise: Floats = (late * (of[:, None] == of)) * late[:, None]
-    noise.ravel()[:: len(noise) + 1] += np.repeat(variances, 2)
+    noise.ravel()[:: len(noise) + 1] += variances.repeat(2)
     return noise
 
 

@@ -171,7 +171,7 @@ def _without_refuted(path: Path, agreements: Sequence[tuple[float, bool]]) -> Pa
     if not any(look.chosen for k in np.flatnonzero(refuted).tolist() for look in path.looks[k]):
         return None
     looks = [
-        tuple(replace(look, chosen=()) for look in seen) if drops else seen
+        tuple(look._replace(chosen=()) for look in seen) if drops else seen
         for seen, drops in zip(path.looks, refuted.tolist(), strict=True)
     ]
     return replace(path, looks=looks)
@@ -195,6 +195,6 @@ def _stays(old: Path, new: Path, sigmas: float) -> bool:
     """
     at = np.arange(0, len(new), LOOKED_AT)
     moved = State(new.states[at]).minus(State(old.states[at]))[:, :NAV, None]
-    chi2 = np.swapaxes(moved, 1, 2) @ np.linalg.solve(new.covariance(at)[:, :NAV, :NAV], moved)
+    chi2 = moved.swapaxes(1, 2) @ np.linalg.solve(new.covariance(at)[:, :NAV, :NAV], moved)
     limit = NAV * sigmas**2
     return bool((chi2 < 4.0 * limit).all() and (chi2 >= limit).sum() <= MAY_MOVE * len(at))

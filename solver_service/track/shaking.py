@@ -143,7 +143,7 @@ def shaking_noise(R: Floats, variances: Floats, span_s: float | Floats) -> Float
         of_node, q = out[..., node, :, :], by_axis[..., node, :, :] * fresh
         of_node[..., PHI[node], PHI[node]] = of_node[..., SHAKE[node], SHAKE[node]] = q
         of_node[..., PHI[node], SHAKE[node]] = across = -q @ R[..., node, :, :]
-        of_node[..., SHAKE[node], PHI[node]] = np.swapaxes(across, -1, -2)
+        of_node[..., SHAKE[node], PHI[node]] = across.swapaxes(-1, -2)
     s, q = out[..., 2, :, :], by_axis[..., 2, :, :]
     s[..., V_, V_] = s[..., SHOVE, SHOVE] = drawn = q * fresh
     s[..., V_, SHOVE] = s[..., SHOVE, V_] = -drawn

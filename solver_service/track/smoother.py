@@ -24,12 +24,12 @@ from buddyline.solver_service.track.state import (
     State,
 )
 from buddyline.solver_service.track.strapdown import predicted
-from buddyline.solver_service.track.trail import EstimateStatus, Look, Step, Trail
+from buddyline.solver_service.track.trail import EstimateStatus, Look, Step, Trail, halved
 from numpy.typing import NDArray
 
 # What rows and pictures need of a covariance: of COLUMNS, half.
-_UPPER: Final = np.triu_indices(len(COLUMNS))
-_BLOCK_UPPER: Final = COLUMNS[_UPPER[0]], COLUMNS[_UPPER[1]]
+_UPPER, _WHOLE = halved(len(COLUMNS))
+_OF_ALL: Final = np.arange(SIZE * SIZE).reshape(SIZE, SIZE)[BLOCK].take(_UPPER)
 # The numbers of Q that Path.drawn is made of. For A's attitude, B's attitude and the velocity each: its variance, the
 # variance of what is shaken, and the nine covariances of both.
 _SHAKING: Final = ((PHI[0], SHAKE[0]), (PHI[1], SHAKE[1]), (V_, SHOVE))
@@ -84,7 +84,7 @@ class Path:
         states = self.states.copy()
         states[:, CLOCK_COLUMN] -= clock_s
         looks = [
-            tuple(replace(look, t_s=look.t_s - clock_s) if look.node else look for look in seen) for seen in self.looks
+            tuple(look._replace(t_s=look.t_s - clock_s) if look.node else look for look in seen) for seen in self.looks
         ]
         return replace(self, states=states, looks=looks)
 
@@ -117,10 +117,7 @@ class Path:
 
     def covariance(self, k: NDArray[np.intp] | int) -> Floats:
         """Give the covariance (..., C, C) of COLUMNS at steps."""
-        halves = self.halves[k]
-        P = np.empty((*halves.shape[:-1], len(COLUMNS), len(COLUMNS)))
-        P[..., _UPPER[0], _UPPER[1]] = P[..., _UPPER[1], _UPPER[0]] = halves
-        return P
+        return self.halves[k].take(_WHOLE, axis=-1)
 
 
 def smoothed(
@@ -148,7 +145,7 @@ def smoothed(
         t_s=np.empty(count),
         rates_radps=np.empty((count, 2, 3)),
         states=np.empty((count, ROW)),
-        halves=np.empty((count, len(_UPPER[0]))),
+        halves=np.empty((count, len(_UPPER))),
         drawn=np.empty((count, 6)),
         without=np.empty((count, 2), dtype=bool),
         statuses=statuses,
@@ -180,11 +177,11 @@ def smoothed(
             P = step.covariance + gain @ (P - P_before) @ gain.T
             P = 0.5 * (P + P.T)
         path.t_s[k], statuses[k] = step.t_s, step.status
-        found[k], path.halves[k] = here, P[_BLOCK_UPPER]
+        found[k], path.halves[k] = here, P.take(_OF_ALL)
         drawn[k] = step.Q[_DRAWN]
         path.rates_radps[k] = step.rates_radps
         looks[k] = tuple(
-            replace(look, residuals=look.residuals.left_by(here[COLUMNS], P[BLOCK])) if look.residuals else look
+            look._replace(residuals=look.residuals.left_by(here[COLUMNS], P[BLOCK])) if look.residuals else look
             for look in step.looks
         )
         later = step

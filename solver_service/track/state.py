@@ -49,7 +49,7 @@ CLOCK_COLUMN: Final = 59
 _DEPTH_OFFSET: Final = 60
 ROW: Final = 61
 _BOTH: Final = slice(PHI[0].start, PHI[1].stop)
-_THREE: Final = 3.0 * np.eye(3)
+_IDENTITY: Final[Floats] = np.eye(3)
 _STILL: Final[Floats] = np.eye(MOVING)
 _OF_PLACE: Final = np.r_[R_, PHI[0], PHI[1]]
 _PLACE: Final = np.ix_(_OF_PLACE, _OF_PLACE)
@@ -170,9 +170,9 @@ class State:
         """
         error = np.empty((*self.row.shape[:-1], SIZE))
         R, other_R = self.R, other.R
-        phi = rotation_log(R[..., 0, :, :] @ np.swapaxes(other_R[..., 0, :, :], -1, -2))
+        phi = rotation_log(R[..., 0, :, :] @ other_R[..., 0, :, :].swapaxes(-1, -2))
         back = rotation_exp(-phi)
-        turn = back @ R[..., 1, :, :] @ np.swapaxes(other_R[..., 1, :, :], -1, -2)
+        turn = back @ R[..., 1, :, :] @ other_R[..., 1, :, :].swapaxes(-1, -2)
         psi = rotation_log(turn)
         along = applied(back, self.r_m) - applied(turn, other.r_m)
         error[..., R_] = np.linalg.solve(left_jacobian(psi), along[..., None])[..., 0]
@@ -202,7 +202,7 @@ class State:
 
 def orthonormal(R: Floats) -> Floats:
     """Return near rotations (..., 3, 3) made exact to second order."""
-    cured: Floats = 0.5 * R @ (_THREE - np.swapaxes(R, -1, -2) @ R)
+    cured: Floats = 0.5 * R @ (3.0 * _IDENTITY - R.swapaxes(-1, -2) @ R)
     return cured
 
 
@@ -237,6 +237,6 @@ def of_place(state: State, P: Floats) -> Floats:
 def place_covariance(state: State, P: Floats) -> Floats:
     """Give the covariance (3, 3) of where A sees B, in level axes."""
     across = skew(state.r_m)
-    J = np.concatenate((np.eye(3), across, -across), axis=1)
+    J = np.concatenate((_IDENTITY, across, -across), axis=1)
     block: Floats = J @ P[_PLACE] @ J.T
     return block

@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 import math
 from abc import abstractmethod
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -96,8 +95,7 @@ class TrackSteps(TrackSights):
         """Write an estimate's present state into its last step, if it keeps steps. looks: of further pictures."""
         if estimate.steps:
             last = estimate.steps.last
-            estimate.steps.last = replace(
-                last,
+            estimate.steps.last = last._replace(
                 after=estimate.state.row,
                 covariance=estimate.covariance,
                 status=estimate.status,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Final, Protocol, TypeAlias
+from typing import Final, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, skew
@@ -38,8 +38,7 @@ _IDENTITY: Final[Floats] = np.eye(3)
 _CONSTANT: Final = np.arange(SIZE) >= MOVING
 
 
-@dataclass(frozen=True, eq=False)
-class Noise:
+class Noise(NamedTuple):
     """Spectral densities of what drives one node: per sqrt(s) of the integral.
 
     gyro_rad, accel_mps: of the samples. gap_gyro_rad, gap_accel_mps: of the motion that no sample tells;
@@ -65,8 +64,7 @@ class Noise:
         """Return the same with the guessed motion's densities times unrest."""
         if unrest == 1.0:
             return self
-        return replace(
-            self,
+        return self._replace(
             gap_accel_mps=unrest * self.gap_accel_mps,
             gap_rate_radps=unrest * self.gap_rate_radps,
             gap_gyro_rad=unrest * self.gap_gyro_rad,
@@ -176,7 +174,7 @@ def integrate(state: Carried, grid: SampleGrid) -> Increments:
     whole: Floats = np.asarray(told.all(axis=1, keepdims=True), np.float64)
     # Where no sample tells at all, bias and mount stand for other things (process_noise).
     mount = rotation_exp(state.mount_rad * told.any(axis=1, keepdims=True))
-    to_true = np.swapaxes(mount, 1, 2)
+    to_true = mount.swapaxes(1, 2)
     biases = np.concatenate((state.accel_bias_mps2, state.gyro_bias_radps), axis=1)
     unbiased = (grid.values - biases[:, None]).reshape(count, 2 * points, 3)
     values = (unbiased @ to_true).reshape(count, points, 6)
@@ -251,7 +249,7 @@ def integrate(state: Carried, grid: SampleGrid) -> Increments:
     by_fast = None
     if grid.fast is not None and whole.any():
         fast_mid = 0.5 * (grid.fast[:, 1:] + grid.fast[:, :-1]).reshape(count, points - 1, 2, 3)
-        by_share = -(turned[..., :3] @ np.swapaxes(fast_mid, 2, 3))
+        by_share = -(turned[..., :3] @ fast_mid.swapaxes(2, 3))
         by_turn = by_share[..., 1] * h[:, :, None]
         swung = np.add.accumulate(by_turn, axis=1)
         tipped = (by_turning @ (swung - 0.5 * by_turn)[..., None])[..., 0]
@@ -405,7 +403,7 @@ def noise_of_steps(
         shaken[still, :NAV] = 0.0
         shaken[still, :, :NAV] = 0.0
     T = invariant_of_plain(after)
-    back = np.swapaxes(T, -1, -2)
+    back = T.swapaxes(-1, -2)
     shaken = T[..., None, :, :] @ shaken @ back[..., None, :, :]
     return T @ Q @ back + np.add.reduce(shaken, axis=-3), walk[..., MOVING:], shaken
 

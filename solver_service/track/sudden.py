@@ -7,7 +7,7 @@ other; his compass is too noisy to tell it in time.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -44,7 +44,7 @@ class SuddenTurn:
 
     def added_to_step(self, step: Step) -> Step:
         """Give a step with this noise."""
-        return replace(step, Q=step.Q + self.Q, walk=step.walk + self.walk)
+        return step._replace(Q=step.Q + self.Q, walk=step.walk + self.walk)
 
     def added_to(self, P: Floats) -> Floats:
         """Give a covariance (SIZE, SIZE) with this noise."""
@@ -65,5 +65,5 @@ def with_sudden(
         P = turn.added_to(estimate.covariance)
         found = likely(P)
         if found.evidence - LEAD > best[0].evidence:
-            best = replace(found, evidence=found.evidence - LEAD), P, turn
+            best = found._replace(evidence=found.evidence - LEAD), P, turn
     return best

@@ -33,8 +33,7 @@ class Residuals:
         return Residuals(self.y - self.H @ error, self.S - self.H @ P @ self.H.T, self.H)
 
 
-@dataclass(frozen=True, eq=False)
-class Look:
+class Look(NamedTuple):
     """One picture within a step, and the lights that were used.
 
     residuals: of these, in a pass about a path, where motion is guessed. Samples tell so much of the motion between two
@@ -61,8 +60,7 @@ class EstimateStatus(NamedTuple):
     north_doubt: float = 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class Step:
+class Step(NamedTuple):
     """One step of a track as the smoother needs it.
 
     before: predicted; after, covariance: with what was seen at t_s. Both are a state's row (ROW,), or the error (SIZE,)
@@ -84,8 +82,22 @@ class Step:
 
 # So many steps are packed at once.
 PACK = 128
-_UPPER, _MOVING_UPPER = np.triu_indices(SIZE), np.triu_indices(MOVING)
-_HALVES = (len(_UPPER[0]),), (len(_MOVING_UPPER[0]),)
+
+
+def halved(size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Give where a symmetric matrix (size, size) has its upper half, and where in that half each of its numbers is.
+
+    The first counts along its rows, one after the other.
+    """
+    upper = np.triu_indices(size)
+    whole = np.empty((size, size), np.intp)
+    whole[upper] = whole.T[upper] = np.arange(len(upper[0]))
+    return np.ravel_multi_index(upper, whole.shape), whole
+
+
+_UPPER, _WHOLE = halved(SIZE)
+_MOVING_UPPER, _MOVING_WHOLE = halved(MOVING)
+_HALVES = _UPPER.shape, _MOVING_UPPER.shape
 _SHAPES = ((), (), (), (), (), (2, 3), *_HALVES, (MOVING, SIZE), (SIZE - MOVING,))
 _ENDS = np.cumsum([math.prod(shape) for shape in _SHAPES]).tolist()
 _PARTS = list(zip([0, *_ENDS], _ENDS, _SHAPES, strict=False))
@@ -118,7 +130,7 @@ def _packed(steps: list[Step]) -> _Pack:
 
 def _row_of(step: Step) -> Floats:
     numbers = np.array((step.t_s, *step.status))
-    halves = step.covariance[_UPPER], step.Q[_MOVING_UPPER]
+    halves = step.covariance.take(_UPPER), step.Q.take(_MOVING_UPPER)
     matrices = step.rates_radps.ravel(), *halves, step.F.ravel()
     return np.concatenate((numbers, *matrices, step.walk, step.before, step.after))
 
@@ -126,10 +138,7 @@ def _row_of(step: Step) -> Floats:
 def _step_of(row: Floats, looks: tuple[Look, ...]) -> Step:
     parts = (row[start:end].reshape(shape) for start, end, shape in _PARTS)
     t_s, light_s, lit_m, lights, doubt, rates, half, of_Q, F, walk = parts
-    covariance = np.empty((SIZE, SIZE))
-    covariance[_UPPER] = covariance.T[_UPPER] = half
-    Q = np.empty((MOVING, MOVING))
-    Q[_MOVING_UPPER] = Q.T[_MOVING_UPPER] = of_Q
+    covariance, Q = half.take(_WHOLE), of_Q.take(_MOVING_WHOLE)
     before, after = row[_ENDS[-1] :].reshape(2, -1)
     status = EstimateStatus(float(light_s), float(lit_m), int(lights), float(doubt))
     return Step(float(t_s), before, after, covariance, F, Q, walk, rates, status, looks)

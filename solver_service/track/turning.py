@@ -70,7 +70,7 @@ class Turning:
             return
         self._white_s = t_s
         R = self._R_level_camera(max(last - 100, 0), last)
-        steps = small_log(np.swapaxes(R[:-1], 1, 2) @ R[1:])
+        steps = small_log(R[:-1].swapaxes(1, 2) @ R[1:])
         third = np.diff(steps, 2, axis=0)
         white = np.median(np.abs(third), axis=0) / (0.6745 * np.sqrt(20.0))
         self._white = np.maximum(white, FLOOR_RAD)

@@ -100,7 +100,7 @@ class Walking:
         across = F @ now.spread
         spread[:, :MOVING, :MOVING] = across @ F.T
         spread[:, :MOVING, MOVING:] = across[:, :, MOVING:]
-        spread[:, MOVING:, :MOVING] = np.swapaxes(across[:, :, MOVING:], 1, 2)
+        spread[:, MOVING:, :MOVING] = across[:, :, MOVING:].swapaxes(1, 2)
         moved[:MOVING] = F @ now.moved
         for k, biases in enumerate(_BIASES):
             for walks, of_node in zip(walking, biases, strict=True):

@@ -148,7 +148,7 @@ class Window:
             H = np.zeros((len(at), 3, PARAMETERS))
             H[:, :, PHI[node]] = np.eye(3)
             H[:, :, OWN[node]] = R @ self.courses[node].G[at]
-            y = (root @ rotation_log(told @ np.swapaxes(R, 1, 2))[..., None]).ravel()
+            y = (root @ rotation_log(told @ R.swapaxes(1, 2))[..., None]).ravel()
             yield (root @ H).reshape(-1, PARAMETERS), y, float(y @ y)
 
     def apart(self, n: NDArray[np.intp], x: Fit) -> tuple[Floats, Floats]:
@@ -198,7 +198,7 @@ class Window:
         J[:, :, CLOCK] += sign * swept + speed
         d = d + x.clock_s * (sign * swept + speed)
         J[:, :, PHI[observer]] += skew(d)
-        toward = np.swapaxes(R_own, 1, 2)
+        toward = R_own.swapaxes(1, 2)
         X = (toward @ d[..., None])[..., 0]
         J = toward @ J
         J[:, :, OWN[observer]] += skew(X) @ own.G[n]

@@ -77,7 +77,7 @@ def filtered(times_s: Floats, seen_s: Floats) -> tuple[float, Trail]:
         if np.abs(t_s - seen_s).min() < 1e-6:
             H = np.eye(SIZE)[np.r_[R_, PHI[0], PHI[1]]]
             track._apply(estimate, H, np.zeros(9), 1e-6 * np.eye(9))
-            after = replace(estimate.steps.last, after=estimate.state.row, covariance=estimate.covariance)
+            after = estimate.steps.last._replace(after=estimate.state.row, covariance=estimate.covariance)
             estimate.steps.last = after
     assert estimate.without == [False, False]
     return start_s, estimate.steps

@@ -101,7 +101,14 @@ def looked(pictures, first=0.8, second=0.8, *, ambiguous=False):
     told = Estimate(0.0, state, np.eye(SIZE), 0.0, confirmed=True, detection=np.array(((first, second), (0.8, 0.8))))
     for k, (seen, within) in enumerate(pictures):
         t_s = 0.1 * (k + 1)
-        learn_found(told, 0, t_s, found_now(told, 0, t_s), within, Association((), np.array(seen), 0.0, ambiguous))
+        learn_found(
+            told,
+            0,
+            t_s,
+            found_now(told, 0, t_s),
+            np.array(within, float),
+            Association((), np.array(seen), 0.0, ambiguous),
+        )
     return told, 0.1 * len(pictures)
 
 

@@ -35,7 +35,7 @@ def passed_about(dive: KnownDive, path: Path) -> Path:
 def off_by(path: Path, error: Floats) -> Path:
     """A path that is off, says so, and has used no light."""
     states = np.stack([path.state(k).plus(error).row for k in range(len(path))])
-    looks = [tuple(replace(look, chosen=()) for look in of_step) for of_step in path.looks]
+    looks = [tuple(look._replace(chosen=()) for look in of_step) for of_step in path.looks]
     return replace(path, states=states, halves=1e3 * path.halves, looks=looks)
 
 
@@ -180,7 +180,7 @@ def test_what_a_slow_dive_says_of_a_picture_without_it_is_exact() -> None:
             continue
         [by_path] = track._by_path(whole, [(guide, sights[key])])
         without = [
-            tuple(replace(look, chosen=()) if (look.node, look.stamp_ns) == key else look for look in looks)
+            tuple(look._replace(chosen=()) if (look.node, look.stamp_ns) == key else look for look in looks)
             for looks in path.looks
         ]
         _, other = passed(replace(path, looks=without))

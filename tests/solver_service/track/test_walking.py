@@ -184,7 +184,7 @@ def tilting(walking: Walking, seen: Floats, *, learns: bool) -> tuple[Walking, F
     parts = unmoved()
     for y in seen:
         tilt = Noise(0.0, 0.0, gap_accel_mps=0.0, gap_rate_radps=0.0, gap_heading_rad=0.0, tilt_rad=TILT_RAD)
-        noises = 2 * (replace(tilt, gap_tilt_rad=walking.densities[4] * TILT_RAD),)
+        noises = 2 * (tilt._replace(gap_tilt_rad=walking.densities[4] * TILT_RAD),)
         shares = kept_shares(parts.without, noises, STEP_S)
         F = F_still.copy()
         F[SHAKE[0], SHAKE[0]] = F[SHAKE[1], SHAKE[1]] = shares[0] * np.eye(3)
