@@ -23,7 +23,7 @@ from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.association import Odds, doubt_of, odds_of
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.intake import TrackIntake, newest_before
-from buddyline.solver_service.track.lights import Sight, alike, in_picture, pixel_of, residuals, with_stamp
+from buddyline.solver_service.track.lights import Sight, in_picture, lasting_factor, pixel_of, residuals, with_stamp
 from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S
 from buddyline.solver_service.track.seeing import EDGE_PX, noise_of
 from buddyline.solver_service.track.start import tilt_of
@@ -223,19 +223,19 @@ class NetEstimate(NetBelief):
             for member in (self.members[bar.other], self.members[bar.observer]):
                 member.light_s = max(member.light_s, bar.sight.t_s)
             self.members[bar.observer].looks_away = False
-        counted = variances * [self._alike(bars[bar], candidate, of) for bar, candidate, of, _ in chosen]
+        counted = variances * [self._lasting_factor(bars[bar], candidate, of) for bar, candidate, of, _ in chosen]
         noise = noise_of(counted, H[n, k, light, :, -1], np.array([id(bars[one].sight) for one in n]))
         sigma_px = [float(bars[bar].sight.sigma_px[candidate]) for bar, candidate, *_ in chosen]
         doubts = np.repeat([doubt_of(one, sigma) for one, sigma in zip(variances.tolist(), sigma_px, strict=True)], 2)
         self._apply(rows.reshape(2 * len(chosen), -1), y[n, k, light].ravel(), noise, doubts)
 
-    def _alike(self, bar: Bar, k: int, light: int) -> float:
+    def _lasting_factor(self, bar: Bar, k: int, light: int) -> float:
         """Give how many pictures tell as much as this one of a light, candidate k (track/seeing.counted); note it."""
         observer, other = self.members[bar.observer], self.members[bar.other]
         key = observer.node, other.node, light
         apart_s = bar.sight.t_s - self.lit_s.get(key, -math.inf)
         self.lit_s[key] = bar.sight.t_s
-        return 1.0 if observer.without or other.without else alike(float(bar.sight.lasting_s[k]), apart_s)
+        return 1.0 if observer.without or other.without else lasting_factor(float(bar.sight.lasting_s[k]), apart_s)
 
     def _judge(self) -> None:
         """Confirm members, and remove those of which no light tells any more."""

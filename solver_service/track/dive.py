@@ -288,10 +288,8 @@ def _clock_s(track: TrackFilter | PathPass, path: Path) -> float:
 
 def _of_one_lamp_each(known: PassedOver, part: Estimate, outputs_ns: Sequence[int], gap: float) -> Smoothed:
     """Give the track that began with one lamp of each node, the dive's beginning with it if that settles, too."""
-    path, believed = (
-        smoothed(part.steps, uses_up=True),
-        (part.shaking.less(known.shares), known, sum(part.lit_pictures)),
-    )
+    path = smoothed(part.steps, uses_up=True)
+    believed = part.shaking.less(known.shares), known, sum(part.lit_pictures)
     # A reflection beside the lit lamp would pass for the dark one, and tell a range.
     lit = np.where(part.detection < NEVER_FOUND, 0.0, part.detection)
     found = settled(path, lit, *believed, doubtful=True)

@@ -189,7 +189,7 @@ def _first(item: tuple[float, float]) -> float:
     return item[0]
 
 
-def alike(one: Estimate, other: Estimate) -> bool:
+def same_pose(one: Estimate, other: Estimate) -> bool:
     """Whether two estimates are of one pose: a twentieth of the range and 0.06 rad."""
     if one.unseen_by != other.unseen_by:
         return False

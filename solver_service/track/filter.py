@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track import anchors
-from buddyline.solver_service.track.estimate import Estimate, alike, lead
+from buddyline.solver_service.track.estimate import Estimate, lead, same_pose
 from buddyline.solver_service.track.forecasts import TOGETHER, DueRow, Forecast, Way, make_rows, of_state
 from buddyline.solver_service.track.inputs import AttitudeSeen, FixSeen, TrackNode
 from buddyline.solver_service.track.intake import newest_before
@@ -144,7 +144,7 @@ class TrackFilter(TrackPool):
         All events up to t_s must have been added. None where there is no such track, or it ends before.
         """
         main = self.main
-        if main is None or not main.confirmed or self.doubted() or not 0.0 <= t_s - main.t_s < BRIDGED_S:
+        if main is None or not main.confirmed or self.withheld() or not 0.0 <= t_s - main.t_s < BRIDGED_S:
             return None
         row = self._last_row
         if row is not None and row[0] is main and max(main.t_s, t_s - LITTLE_S) <= row[1].t_s <= t_s:
@@ -168,7 +168,7 @@ class TrackFilter(TrackPool):
         shaking = self._with_sudden(estimate.shaking.variances, sudden_rad)
         return Forecast(t_s, Way(span_s, state, P, (a, b), noises, shares, shaking))
 
-    def doubted(self) -> bool:
+    def withheld(self) -> bool:
         """Whether a live track is not to be told; `problems` says why.
 
         No fix has agreed with it, and few pictures have shown both lights. Or its clocks prove further apart than it
@@ -401,7 +401,7 @@ class TrackFilter(TrackPool):
             over = t_s - estimate.start_s > estimate.patience_s and (alive or estimate.evidence < CONFIRMED)
             if estimate.evidence < GIVEN_UP or over or any(lead(other, estimate) > REFUTED for other in pool):
                 continue
-            if not any(alike(estimate, better) for better in alive):
+            if not any(same_pose(estimate, better) for better in alive):
                 alive.append(estimate)
         return alive[:MAX_TENTATIVE]
 
@@ -430,7 +430,7 @@ class TrackFilter(TrackPool):
         if self.main is None or not self.main.confirmed or t_s < self.main.t_s:
             return None
         main = self.main
-        if self.doubted():
+        if self.withheld():
             return None
         while t_s - main.t_s > 1.5 * TICK_S:
             self._step(main, main.t_s + TICK_S, None)

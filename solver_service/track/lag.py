@@ -40,7 +40,7 @@ class TrackLag:
 
     def _rows(self, lag_s: float, every_s: float) -> list[TrackRow]:
         main = self._track.main
-        if main is None or not main.confirmed or len(main.steps) < 2 or not self._due or self._track.doubted():
+        if main is None or not main.confirmed or len(main.steps) < 2 or not self._due or self._track.withheld():
             return []
         ready_s = main.t_s - lag_s
         ready = [stamp for stamp in self._due if self._track.pair_seconds(stamp) <= ready_s]

@@ -218,7 +218,7 @@ class Sight:
         return max(len(self.bearings) + self.elsewhere - 1.0, 1.0)
 
 
-def alike(lasting_s: float, apart_s: float) -> float:
+def lasting_factor(lasting_s: float, apart_s: float) -> float:
     """Give how many pictures tell as much as one of a light whose errors last, apart_s after it was last used."""
     return 1.0 + lasting_s / max(apart_s, LEAST_APART_S)
 

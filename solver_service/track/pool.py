@@ -42,6 +42,10 @@ LEAST_WINDOW_S: Final = 13.5
 WINDOW_EVERY_S: Final = 3.0
 LIT: Final = 0.9
 UNLIT: Final = 0.05
+# A start that waits for the other node takes each of its candidates within this chi^2 (2 degrees of freedom) for either
+# light; before the picture each was as likely as this.
+FORK_GATE: Final = 12.0
+FORK_SHARE: Final = 0.2
 # The noise of the lights that a start is made of: one in thirty is off by many pixels.
 START_PX: Final = 2.5
 # A replay starts with these sigmas: a share of the range, rad, or so many of the learned sigmas where that is more.
@@ -257,7 +261,7 @@ class TrackPool(TrackSteps):
                     continue
                 S = H[k, light] @ P @ H[k, light].T + sight.sigma_px[k] ** 2 * np.eye(2)
                 chi2 = float(y[k, light] @ np.linalg.solve(S, y[k, light]))
-                if chi2 > 12.0:
+                if chi2 > FORK_GATE:
                     continue
                 child = estimate.copied(unseen_by=None)
                 chosen = ((k, light, START_PX**2),)
@@ -269,7 +273,7 @@ class TrackPool(TrackSteps):
                 if spread <= 0.0:
                     raise ArithmeticError("a light's place without a covariance")
                 gain = -0.5 * chi2 - 0.5 * math.log(spread) - math.log(2.0 * math.pi) - log_clutter
-                child.evidence += gain + math.log(0.2)
+                child.evidence += gain + math.log(FORK_SHARE)
                 self._update_lights(child, Association(chosen, np.ones(2), 0.0), near_y, near_H, sight)
                 child.used[sight.node, sight.stamp_ns] = chosen
                 child.looks_away[sight.node] = False

@@ -18,7 +18,7 @@ from buddyline.solver_service.track.lights import (
     BLOCK,
     COLUMNS,
     Sight,
-    alike,
+    lasting_factor,
     light_positions,
     residuals,
     share_before,
@@ -264,7 +264,7 @@ class TrackSights(TrackMoves):
         # Where motion is guessed, errors that last are not counted in the noise, and a gap must not be made of them.
         apart_s = sight.t_s - float(estimate.lit_s[sight.node].max())
         lasting_s = max(float(sight.lasting_s[k]) for k, *_ in found.chosen)
-        own = 1.0 / alike(lasting_s, apart_s) if any(estimate.without) else 1.0
+        own = 1.0 / lasting_factor(lasting_s, apart_s) if any(estimate.without) else 1.0
         stretched = by_scale(rows_H, estimate.state, other, lights_m), own
         error, chi2 = told_by(estimate, rows_H, rows_y, noise, more, doubts, stretched)
         estimate.state = estimate.state.plus(error)
@@ -426,7 +426,7 @@ def counted(chosen: Chosen, sight: Sight, estimate: Estimate) -> Chosen:
     if not estimate.confirmed or any(estimate.without):
         return chosen
     lasting_s, apart_s = sight.lasting_s.tolist(), (sight.t_s - estimate.lit_s[sight.node]).tolist()
-    return tuple((k, light, variance * alike(lasting_s[k], apart_s[light])) for k, light, variance in chosen)
+    return tuple((k, light, variance * lasting_factor(lasting_s[k], apart_s[light])) for k, light, variance in chosen)
 
 
 def counted_more(chosen: Chosen, used: Chosen) -> Floats:

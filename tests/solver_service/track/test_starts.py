@@ -104,10 +104,10 @@ def test_fixes_that_are_off_for_long_contradict_a_track(
     assert track.main.contradicted == 0
     said = f"{track.both}: poses contradict the live track"
     track.advance(off[4].stamp_ns)
-    assert track.doubted() is contradicted
+    assert track.withheld() is contradicted
     assert said not in track.problems
     track.advance(off[11].stamp_ns)
-    assert track.doubted() is contradicted
+    assert track.withheld() is contradicted
     assert (said in track.problems) is contradicted
 
 
