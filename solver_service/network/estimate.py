@@ -25,9 +25,10 @@ from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.intake import TrackIntake, newest_before
 from buddyline.solver_service.track.lights import Sight, in_picture, lasting_factor, pixel_of, residuals, with_stamp
 from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S
-from buddyline.solver_service.track.seeing import EDGE_PX, noise_of
+from buddyline.solver_service.track.seeing import noise_of
 from buddyline.solver_service.track.start import tilt_of
 from buddyline.solver_service.track.stepping import TICK_S
+from buddyline.solver_service.track.visible import EDGE_PX
 from numpy.typing import NDArray
 
 # A node is confirmed once its lights explain the pictures better than clutter by this (log odds). It leaves below

@@ -112,60 +112,6 @@ def in_picture(camera: Camera, pixel_px: Floats | None, margin_px: float = 0.0) 
     )
 
 
-def share_within(camera: Camera, X: Floats, D: Floats, P: Floats, margin_px: float) -> Floats:
-    """Give how likely each light (..., L) lies within the picture, margin_px from its edges.
-
-    X (..., L, 3), D (..., L, 3, C): the lights and how errors of covariance P (..., C, C) move them, as
-    `light_positions` gives them. The errors of u and v are taken to be independent.
-    """
-    share = np.zeros(X.shape[:-1])
-    of_all = X.reshape(-1, 3)
-    pixels = {light: pixel for light, each in enumerate(of_all) if (pixel := pixel_of(camera, each)) is not None}
-    if not pixels:
-        return share
-    lights, at = list(pixels), np.array(list(pixels.values()))
-    _, tangents = camera.rays(at)
-    J = tangents @ D.reshape(-1, *D.shape[-2:])[lights] / np.sqrt((of_all[lights] ** 2).sum(axis=1))[:, None, None]
-    P_of_each = P.reshape(-1, *P.shape[-2:])[np.array(lights) // X.shape[-2]]
-    shares = share.reshape(-1)
-    for light, inside in zip(lights, _shares(camera, at, (J @ P_of_each * J).sum(axis=2), margin_px), strict=True):
-        # The model of a distorted lens ends outside of the picture.
-        shares[light] = inside if inside > 0.0 else 0.0
-    return share
-
-
-def share_before(
-    camera: Camera, X: Floats, D: Floats, P: Floats, margin_px: float, y: Floats, H: Floats, sigma_px: Floats
-) -> tuple[float, Floats]:
-    """Give how likely a light (3,), D (3, C), was within an earlier picture, and the same if it is each candidate now.
-
-    X, D: at that picture's time. y (K, 2), H (K, 2, C), sigma_px (K,): of the candidates, as `residuals` gives them.
-    """
-    at = pixel_of(camera, X)
-    if at is None:
-        return 0.0, np.zeros(len(y))
-    J = camera.rays(at[None])[1][0] @ D / np.linalg.norm(X)
-    across, of_all = P @ H.swapaxes(1, 2), P @ J.T
-    S = H @ across + sigma_px[:, None, None] ** 2 * np.eye(2)
-    gain = np.swapaxes(np.linalg.solve(S, H @ of_all), 1, 2)
-    moved = (gain @ np.where(np.isfinite(y), y, 0.0)[..., None])[..., 0]
-    first = (J * of_all.T).sum(axis=1)
-    less = (gain * (J @ across)).sum(axis=2)
-    before, *if_now = _shares(camera, np.vstack((at, at + moved)), np.vstack((first, first - less)), margin_px)
-    return before, np.array(if_now)
-
-
-def _shares(camera: Camera, at: Floats, variances_px2: Floats, margin_px: float) -> list[float]:
-    """Give how likely pixels (N, 2), whose variances (N, 2) are independent, lie in the picture."""
-    size_px = np.array((camera.width_px, camera.height_px))
-    reach_px = np.sqrt(2.0 * np.maximum(variances_px2, SMALL_PX))
-    near, far = (margin_px - 0.5 - at) / reach_px, (size_px - 0.5 - margin_px - at) / reach_px
-    return [
-        math.prod(0.5 * (math.erf(b) - math.erf(a)) for a, b in zip(below, above, strict=True))
-        for below, above in zip(near.tolist(), far.tolist(), strict=True)
-    ]
-
-
 def pixel_of(camera: Camera, X: Floats) -> Floats | None:
     """Return where a point (3,) of the camera frame is imaged (2,): Newton's method on the inverse model.
 

@@ -26,16 +26,13 @@ from buddyline.solver_service.track.lights import COLUMNS, Sight, in_picture, pi
 from buddyline.solver_service.track.moving import HOLD_S
 from buddyline.solver_service.track.records import Records
 from buddyline.solver_service.track.seeing import (
-    EDGE_PX,
     ONE_TRIGGER_S,
     BySight,
     PassGuide,
     counted,
     counted_more,
     doubts_of,
-    found_now,
     in_front,
-    learn_found,
     light_rows,
     note_lit,
     stacked,
@@ -56,6 +53,7 @@ from buddyline.solver_service.track.strapdown import (
     sampled,
 )
 from buddyline.solver_service.track.trail import Look, Residuals, Step
+from buddyline.solver_service.track.visible import EDGE_PX, found_now, learn_found
 from buddyline.solver_service.track.walking import Walking
 
 # What is believed of the place at first, 1 sd, as a share of the range.

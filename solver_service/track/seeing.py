@@ -21,8 +21,6 @@ from buddyline.solver_service.track.lights import (
     lasting_factor,
     light_positions,
     residuals,
-    share_before,
-    share_within,
     with_stamp,
 )
 from buddyline.solver_service.track.moving import KNOWN_CLOCK_S, TrackMoves
@@ -41,25 +39,23 @@ from buddyline.solver_service.track.state import (
 )
 from buddyline.solver_service.track.sudden import SuddenTurn, with_sudden
 from buddyline.solver_service.track.trail import Chosen, Look
+from buddyline.solver_service.track.visible import (
+    EDGE_PX,
+    INSIDE,
+    by_last_picture,
+    found_now,
+    learn_found,
+    share_within,
+)
 from numpy.typing import NDArray
 
 # Both nodes' pictures of one trigger are less than this apart.
 ONE_TRIGGER_S: Final = 0.03
-# A light nearer to the picture's edge need not be found: part of its spot is outside. A light should be found whose
-# probability to be further inside is above INSIDE.
-EDGE_PX: Final = 2.0
-INSIDE: Final = 0.9
 # Without units, the place must also be known better than to this share of the range, 1 sd: the error of linearization
 # looks like a walk, too.
 WIDE_SHARE: Final = 0.02
 # A wide estimate takes its lights in so many steps.
 ABOUT_STEPS: Final = 4
-# A lamp stays hidden, or in view, for about so long. It is found in a share of its pictures between the next two.
-# One that is found most often is hidden as rarely as it is missed while it is in view.
-HIDDEN_S: Final = 1.0
-MOST_FOUND: Final = 0.97
-LEAST_FOUND: Final = 0.02
-FOUND_IN_VIEW: Final = math.sqrt(MOST_FOUND)
 # What a smoothed path's covariance leaves of a light's variance is this share of it at least: where it is known to some
 # hundredths, and where to rounding.
 LEAST_LEFT: Final = 0.02
@@ -133,11 +129,11 @@ class TrackSights(TrackMoves):
             found = by_path.odds.associate(sight.sigma_px, detection, within, least)
         else:
             clutter = sight.clutter / camera.area_px2
-            at = estimate.state, estimate.rates_radps, sight.t_s - estimate.t_s
+            rigs = self.nodes[observer].rig, self.nodes[1 - observer].rig
 
             def likely(P: Floats) -> Association:
                 P = with_stamp(P[BLOCK])
-                now, by_last = self._by_last(estimate, sight, at, within, y, H, P)
+                now, by_last = by_last_picture(estimate, sight, rigs, within, y, H, P)
                 return associate(y, H, P, sight.sigma_px, detection, clutter, now, least, by_last)
 
             found, estimate.covariance, turn = with_sudden(estimate, self._turning_s(estimate), likely)
@@ -276,37 +272,6 @@ class TrackSights(TrackMoves):
         estimate.trigger_lights += [(sight.t_s, sight.node, light) for _, light, _ in found.chosen]
         return used
 
-    def _by_last(
-        self,
-        estimate: Estimate,
-        sight: Sight,
-        at: tuple[State, Floats, float],
-        within: Floats,
-        y: Floats,
-        H: Floats,
-        P: Floats,
-    ) -> tuple[Floats, Floats | None]:
-        """Give how likely each light is within a picture, and log odds (K, 2) of its candidates, by the last picture.
-
-        A light that was not seen there, and was in view, was outside. So it has come in since, or is outside still: it
-        is hardly a candidate that stands where it would have been in the last picture, too. at: a state, its turn rates
-        and the picture's time after it.
-        """
-        missing = estimate.missing[sight.node].tolist()
-        if not estimate.confirmed or not any(missing):
-            return within, None
-        state, rates_radps, after_s = at
-        camera, lights_m = self.nodes[sight.node].rig.camera, self.nodes[1 - sight.node].rig.lights_m
-        then_s = np.array((after_s + estimate.shown_s[sight.node] - sight.t_s,))
-        X, D = light_positions(state, sight.node, lights_m, rates_radps, then_s)
-        now, logs = within.copy(), np.zeros(y.shape[:2])
-        for light, c in enumerate(missing):
-            of_all = y[:, light], H[:, light], sight.sigma_px
-            before, if_now = share_before(camera, X[0, light], D[0, light], P, EDGE_PX, *of_all)
-            logs[:, light] = np.log((1.0 - c * if_now) / (1.0 - c * before))
-            now[light] = max(within[light] - c * min(within[light], before), 0.0) / (1.0 - c * before)
-        return now, logs
-
     def _apply(self, estimate: Estimate, H: Floats, y: Floats, noise: Floats) -> None:
         """Update an estimate by what is no light."""
         error, _ = told_by(estimate, H, y, noise)
@@ -363,46 +328,6 @@ def told_by(
         estimate.by_shaking = rest @ (estimate.by_shaking + pulled.T)
         estimate.shaken = rest @ estimate.shaken @ rest.T
     return error, chi2
-
-
-def found_now(estimate: Estimate, observer: int, t_s: float) -> Floats:
-    """Give how likely each light (2,) in an observer's picture at t_s is found: as just before, or as it is on average.
-
-    A lamp that is known not to be lit is not found. Starts compete by how often each has a lamp found, not by its being
-    missing for long: a wrong one would have its missing lamp explained.
-    """
-    share: Floats = estimate.detection[observer]
-    if not estimate.confirmed:
-        return share.copy()
-    kept = math.exp(-max(t_s - estimate.shown_s[observer], 0.0) / HIDDEN_S)
-    both = zip(share.tolist(), estimate.shown[observer].tolist(), strict=True)
-    return np.array(
-        [min(max(lit + kept * (now - lit), LEAST_FOUND), MOST_FOUND) if lit > 0.0 else 0.0 for lit, now in both]
-    )
-
-
-def learn_found(
-    estimate: Estimate, observer: int, t_s: float, found: Floats, within: Floats, association: Association
-) -> None:
-    """Take into an estimate whether each light that should be in a picture was seen there (2,).
-
-    found (2,): how likely that was, by `found_now`. A lamp that is not seen may be in view and missed, too. A picture
-    with a candidate that may be either light teaches nothing: the next ones would repeat what it says of the two.
-    """
-    estimate.shown[observer], estimate.shown_s[observer] = found, t_s
-    estimate.missing[observer] = found * (1.0 - association.seen)
-    estimate.missing[observer, [light for _, light, _ in association.chosen]] = 0.0
-    if association.ambiguous:
-        return
-    shares = estimate.detection[observer].tolist()
-    of_each = zip(shares, found.tolist(), within.tolist(), association.seen.tolist(), strict=True)
-    for light, (share, likely, inside, seen) in enumerate(of_each):
-        if share > 0.0:
-            if inside > INSIDE:
-                followed = share + 0.05 * (seen - share)
-                estimate.detection[observer, light] = min(max(followed, LEAST_FOUND), MOST_FOUND)
-            missing = likely * (1.0 - FOUND_IN_VIEW * inside) / (1.0 - likely * inside)
-            estimate.shown[observer, light] = FOUND_IN_VIEW * seen + (1.0 - seen) * missing
 
 
 def light_rows(chosen: Chosen, y: Floats, H: Floats) -> tuple[Floats, Floats, Floats]:

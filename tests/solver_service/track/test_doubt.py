@@ -19,12 +19,11 @@ from buddyline.solver_service.track.lights import (
     in_picture,
     light_positions,
     pixel_of,
-    share_before,
-    share_within,
     sights_of,
 )
 from buddyline.solver_service.track.state import GYRO_BIAS, MOVING, PHI, SIZE, invariant_of_plain
 from buddyline.solver_service.track.sudden import SuddenTurn, with_sudden
+from buddyline.solver_service.track.visible import share_before, share_within
 
 from tests.solver_service.track.dives import Setting, bare_of, filter_of, make, project
 

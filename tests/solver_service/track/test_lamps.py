@@ -14,8 +14,8 @@ from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.track.association import Association
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.lamps import LampWatch
-from buddyline.solver_service.track.seeing import found_now, learn_found
 from buddyline.solver_service.track.state import SIZE, State
+from buddyline.solver_service.track.visible import found_now, learn_found
 from buddyline.solver_service.tracking import TrackSettings
 
 from tests.solver_service.track.dives import EPOCH_NS
