@@ -68,14 +68,13 @@ class Odds(NamedTuple):
 
         within (2,): how likely each light is within the picture; detection (2,): how likely it is found there.
         """
-        cases, logs = self.cases, self.logs
-        if not detection.all():
-            lit = detection.tolist()
+        cases, logs, lit = self.cases, self.logs, detection.tolist()
+        if not all(lit):
             kept = [n for n, case in enumerate(cases) if all(lit[k] or one is None for k, one in enumerate(case))]
             cases, logs = [cases[n] for n in kept], logs[kept]
         first, second = (
             (math.log(max(1.0 - found * inside, 1e-6)), math.log(found) if found > 0.0 else -math.inf)
-            for found, inside in zip(detection.tolist(), within.tolist(), strict=True)
+            for found, inside in zip(lit, within.tolist(), strict=True)
         )
         return cases, logs + [first[one is not None] + second[two is not None] for one, two in cases]
 
@@ -91,30 +90,35 @@ class Odds(NamedTuple):
         weights = np.exp(logs - top)
         total = float(weights.sum())
         weights /= total
-        marginal: dict[tuple[int, int], list[float]] = {}
-        seen = [0.0, 0.0]
+        # By light: of each candidate, how likely it is that light, off by a common error and by a gross one.
+        marginal: tuple[dict[int, list[float]], dict[int, list[float]]] = {}, {}
         for case, weight in zip(cases, weights.tolist(), strict=True):
-            for light, picked in enumerate(case):
+            for of_light, picked in zip(marginal, case, strict=True):
                 if picked is not None:
-                    seen[light] += weight
-                    marginal.setdefault((picked[0], light), [0.0, 0.0])[picked[1]] += weight
-        chosen: list[tuple[int, int, float]] = []
+                    k, mode = picked
+                    if k not in of_light:
+                        of_light[k] = [0.0, 0.0]
+                    of_light[k][mode] += weight
         # Which light such a candidate is, the next pictures mostly tell no better: it is left out, not guessed.
-        ambiguous = {k for k, _ in marginal if all(sum(marginal.get((k, light), ())) > 1.0 - SURE for light in (0, 1))}
-        for (k, light), (common, gross) in sorted(marginal.items()):
-            if common + gross > least and k not in ambiguous:
-                doubt_px2 = 0.0 if common + gross > SURE else self._doubt_px2(k, light, marginal)
-                chosen.append((k, light, variance_of(float(sigma_px[k]), common, gross) + doubt_px2))
-        return Association(tuple(chosen), np.array(seen), top + math.log(total), bool(ambiguous))
+        first, second = marginal
+        ambiguous = {k for k in first.keys() & second.keys() if min(sum(first[k]), sum(second[k])) > 1.0 - SURE}
+        chosen: list[tuple[int, int, float]] = []
+        for light, of_light in enumerate(marginal):
+            for k, (common, gross) in of_light.items():
+                if common + gross > least and k not in ambiguous:
+                    doubt_px2 = 0.0 if common + gross > SURE else self._doubt_px2(k, light, of_light)
+                    chosen.append((k, light, variance_of(float(sigma_px[k]), common, gross) + doubt_px2))
+        seen = [sum(map(sum, of_light.values())) for of_light in marginal]
+        return Association(tuple(sorted(chosen)), np.array(seen), top + math.log(total), bool(ambiguous))
 
-    def _doubt_px2(self, k: int, light: int, marginal: Mapping[tuple[int, int], Sequence[float]]) -> float:
+    def _doubt_px2(self, k: int, light: int, of_light: Mapping[int, Sequence[float]]) -> float:
         """Give what the variance of a light, candidate k, gains because it may be another candidate or none.
 
         That is how far off k would be, as a mean square; a light that is no candidate is where it was predicted. One
         variance stands poorly for places far apart, so the prediction's is added: no variance is more than halved.
         """
         y = self.y_px[k, light]
-        odds = {other: sum(found) for (other, of), found in marginal.items() if of == light}
+        odds = {other: sum(found) for other, found in of_light.items()}
         apart_px2 = sum(share * float(((self.y_px[other, light] - y) ** 2).sum()) for other, share in odds.items())
         missing = max(1.0 - sum(odds.values()), 0.0)
         return apart_px2 + missing * float(y @ y) + float(self.spread_px2[k, light])
@@ -196,9 +200,9 @@ def _single(
     chi2 = (c * (u * u) - 2.0 * b * (u * v) + a * (v * v)) / det
     log_l = _LOG_SHARES[:, None, None] - 0.5 * (chi2 + np.log(det)) - log_clutter[:, None, None, None]
     # A lamp that is nowhere in the picture is no candidate's, however little the track knows.
-    near = np.argwhere((chi2 < GATE) & (np.abs(y).max(axis=-1) < NOWHERE_PX)[:, None])
+    near = ((chi2 < GATE) & (np.abs(y).max(axis=-1) < NOWHERE_PX)[:, None]).nonzero()
     options: list[tuple[list[_Option], list[_Option]]] = [([], []) for _ in y]
-    for (n, mode, k, light), log in zip(near.tolist(), log_l[tuple(near.T)].tolist(), strict=True):
+    for n, mode, k, light, log in zip(*(each.tolist() for each in (*near, log_l[near])), strict=True):
         options[n][light].append((log, k, mode))
     for found in chain.from_iterable(options):
         found.sort(reverse=True)

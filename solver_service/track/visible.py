@@ -104,8 +104,10 @@ def learn_found(
     with a candidate that may be either light teaches nothing: the next ones would repeat what it says of the two.
     """
     estimate.shown[observer], estimate.shown_s[observer] = found, t_s
-    estimate.missing[observer] = found * (1.0 - association.seen)
-    estimate.missing[observer, [light for _, light, _ in association.chosen]] = 0.0
+    missing = (found * (1.0 - association.seen)).tolist()
+    for _, light, _ in association.chosen:
+        missing[light] = 0.0
+    estimate.missing[observer] = missing
     if association.ambiguous:
         return
     shares = estimate.detection[observer].tolist()
@@ -115,8 +117,8 @@ def learn_found(
             if inside > INSIDE:
                 followed = share + 0.05 * (seen - share)
                 estimate.detection[observer, light] = min(max(followed, LEAST_FOUND), MOST_FOUND)
-            missing = likely * (1.0 - FOUND_IN_VIEW * inside) / (1.0 - likely * inside)
-            estimate.shown[observer, light] = FOUND_IN_VIEW * seen + (1.0 - seen) * missing
+            unseen = likely * (1.0 - FOUND_IN_VIEW * inside) / (1.0 - likely * inside)
+            estimate.shown[observer, light] = FOUND_IN_VIEW * seen + (1.0 - seen) * unseen
 
 
 def by_last_picture(
