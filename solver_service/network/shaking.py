@@ -24,7 +24,7 @@ from buddyline.solver_service.track.shaking import (
     nothing_learned,
 )
 
-# A picture's weight is halved after so many more of each member.
+# An update's weight is halved after so many more for each member: one update takes all pictures of a trigger.
 HALVED: Final = 100.0
 _FIRST, *_BOUNDS = (np.array((logs[0], logs[2])) for logs in (FIRST_LOGS, LEAST, MOST))
 _I: Final = np.eye(3)
@@ -70,7 +70,7 @@ class NetShaking:
         return NetShaking(self.logs, self.information, onward @ self.parts @ onward.swapaxes(-1, -2) + drawn)
 
     def taught(self, y: Floats, S_inverse: Floats, H: Floats, gain: Floats) -> NetShaking:
-        """Go on by one picture's residuals y (m,), H (m, N), by Fisher's scoring (Shaking.taught).
+        """Go on by one update's residuals y (m,), H (m, N), by Fisher's scoring (Shaking.taught).
 
         gain (N, m): of the update. S_inverse (m, m): of the residuals, as they are to be learned from.
 
