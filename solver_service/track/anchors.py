@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -24,17 +25,16 @@ def attitude_residual(state: State, node: int, R_level_camera: Floats) -> tuple[
 def attitude_covariance(R_ned_body: Floats, sigma_rad: Floats, tilt_factor: float, heading_factor: float) -> Floats:
     """Give the covariance (3, 3) of an attitude's error in level axes, its variances inflated by the factors.
 
-    R = Rz(yaw) Ry(pitch) Rx(roll): an error of roll turns about the body's x axis, of pitch about the level line across
-    the heading, of yaw about the vertical.
+    An error of roll counts about the level line along the heading, of pitch about that across it, of yaw about the
+    vertical. Euler's roll turns about the body's x axis; but a node's filter does not know better which way is down
+    where it looks up or down, and states the same sigmas there.
     """
-    forward = R_ned_body[:, 0]
-    across = np.array((-forward[1], forward[0], 0.0))
-    length = float(np.linalg.norm(across))
-    across = across / length if length > 1e-6 else np.array((0.0, 1.0, 0.0))
-    axes = np.stack((forward, across, np.array((0.0, 0.0, 1.0))), axis=1)
+    x, y = R_ned_body[0, 0], R_ned_body[1, 0]
+    length = math.hypot(x, y)
+    ahead, across = (x / length, y / length) if length > 1e-6 else (1.0, 0.0)
+    axes = np.array(((ahead, -across, 0.0), (across, ahead, 0.0), (0.0, 0.0, 1.0)))
     variances = sigma_rad**2 * np.array((tilt_factor, tilt_factor, heading_factor))
-    # Straight up or down the three axes are two: a little of all keeps it a covariance.
-    covariance: Floats = (axes * variances) @ axes.T + 1e-8 * np.eye(3)
+    covariance: Floats = (axes * variances) @ axes.T
     return covariance
 
 

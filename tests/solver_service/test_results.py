@@ -11,6 +11,7 @@ from buddyline.protocol.messages import Blob, Candidates
 from buddyline.solver_service.geometry.direction import ANY_AZIMUTH_RAD, direction_of
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, rotation_exp
 from buddyline.solver_service.results import in_ned, view_of
+from buddyline.solver_service.track.anchors import attitude_covariance
 from msgspec import UNSET
 
 from tests.tools.evaluated import pose
@@ -48,13 +49,19 @@ def said(attitude_rad, P, t_m=T_M, sigma_rad=SIGMA_RAD):
     return made, np.array([*made.sigma_ned_m, made.sigma_azimuth_rad, made.sigma_inclination_rad])
 
 
-@pytest.mark.parametrize("attitude_rad", [(0.0, 0.0, 0.0), (0.3, -0.4, 2.5), (-1.2, 0.9, -1.0), (3.0, 0.2, 0.4)])
+@pytest.mark.parametrize(
+    "attitude_rad", [(0.0, 0.0, 0.0), (0.3, -0.4, 2.5), (-1.2, 0.9, -1.0), (3.0, 0.2, 0.4), (0.3, 1.5, 2.0)]
+)
 def test_sigmas_are_those_of_numeric_differences(attitude_rad):
     P = covariance(np.random.default_rng(1))
     made, sigmas = said(attitude_rad, P)
 
+    R = attitude(*np.array(attitude_rad))
+    # Roll is about the level line ahead, pitch about that across, also where a node looks up.
+    level = attitude(0.0, 0.0, np.arctan2(R[1, 0], R[0, 0]))
+
     def at(x):
-        return angles(attitude(*(np.array(attitude_rad) + x[3:])) @ R_BODY_CAMERA @ (np.array(T_M) + x[:3]))
+        return angles(rotation_exp(level @ x[3:]) @ R @ R_BODY_CAMERA @ (np.array(T_M) + x[:3]))
 
     assert np.allclose(at(np.zeros(6))[:3], made.t_ned_m, atol=1e-12)
     step = 1e-6
@@ -71,10 +78,19 @@ def test_errors_drawn_from_covariance_and_attitude_spread_as_said():
     made, sigmas = said(told, P)
     count = 40_000
     t_m = rng.multivariate_normal(T_M, P[:3, :3], count)
-    R = attitude(*(told + SIGMA_RAD * rng.standard_normal((count, 3))).T)
+    turns = rotation_exp(SIGMA_RAD * rng.standard_normal((count, 3)) @ attitude(0.0, 0.0, told[2]).T)
+    R = turns @ attitude(*told)
     spread = angles((R @ R_BODY_CAMERA @ t_m[:, :, None])[:, :, 0]) - angles(np.array(made.t_ned_m))
     # First order, with a heading of 4 degrees: within a few per cent.
     assert np.sqrt((spread**2).mean(axis=0)) == pytest.approx(sigmas, rel=0.03)
+
+
+@pytest.mark.parametrize("pitch_rad", [0.0, 0.8, 1.5, math.pi / 2, -1.5])
+def test_no_level_axis_of_an_attitude_is_known_better_than_another_where_a_node_looks_up(pitch_rad):
+    """A filter does not know better which way is down there, and states the same sigmas."""
+    R = attitude(0.4, pitch_rad, -2.0)
+    known = attitude_covariance(R, np.array([0.02, 0.02, 0.07]), 1.0, 1.0)
+    assert np.allclose(known, np.diag([0.02, 0.02, 0.07]) ** 2, rtol=1e-9)
 
 
 def test_a_compass_that_is_worse_widens_the_azimuth_and_hardly_the_inclination():
