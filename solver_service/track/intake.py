@@ -28,6 +28,8 @@ from buddyline.solver_service.track.units import clipped, fault_of, stuck
 
 CHECK_EVERY_S: Final = 2.0
 SILENT_S: Final = 1.0
+# For so long an attitude tells how its node stands.
+ATTITUDE_HOLD_S: Final = 0.5
 # A node that has told nothing for so long, and for GONE_PICTURES of its own, is gone. Nothing says how it turns then:
 # its lamps alone look the same whether it turns to the left or to the right.
 GONE_S: Final = 0.5
@@ -170,14 +172,10 @@ class TrackIntake:
             self._compared_s = t_s
             self._compare_gyros(t_s)
         for node, samples in enumerate(self.samples):
-            seen = newest_before(self.attitudes[node], t_s)
-            down = None
-            if seen is not None and t_s - seen[0] < 0.5:
-                down = self.level_camera(node, seen[1])[2]
             name, lately = self.nodes[node].name, samples.last(t_s, CHECK_EVERY_S)
             unchanging, found = stuck(name, lately), self._fault_found(node, t_s)
             if unchanging is None:
-                fault = fault_of(name, lately[:, :3], down) or found
+                fault = fault_of(name, *self._lately_forced(node, t_s)) or found
             else:
                 fault = found if found and node in self._known_faults else unchanging
                 if samples.trusted:
@@ -195,6 +193,23 @@ class TrackIntake:
                 )
                 self._problems.report(said, t_s)
                 self._rejected[node] = samples.rejected
+
+    def _lately_forced(self, node: int, t_s: float) -> tuple[Floats, Floats | None]:
+        """Give the force (N, 3) of the last seconds' samples, and R_level_camera (N, 3, 3) at each by the attitudes.
+
+        Samples later than an attitude by ATTITUDE_HOLD_S are left out; no R where the newest one is that old.
+        """
+        start_s, items = t_s - CHECK_EVERY_S, self.attitudes[node]
+        times_s, force = self.samples[node].last_forced(t_s, CHECK_EVERY_S)
+        first = bisect.bisect_left(items, start_s - ATTITUDE_HOLD_S, key=time_of)
+        seen = items[first : bisect.bisect_right(items, t_s, key=time_of)]
+        if not seen or t_s - seen[-1][0] >= ATTITUDE_HOLD_S:
+            return force, None
+        seen_s = np.array([at_s for at_s, _ in seen])
+        at = np.searchsorted(seen_s, times_s, side="right") - 1
+        near = (at >= 0) & (times_s - seen_s[at] < ATTITUDE_HOLD_S)
+        R = np.array([one.R_ned_body for _, one in seen]) @ self.nodes[node].rig.R_body_camera
+        return force[near], R[at[near]]
 
     def _compare_gyros(self, t_s: float) -> None:
         """Judge gyros by the attitudes of the last seconds; where these do not tell, what was found stays."""

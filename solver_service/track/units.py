@@ -53,21 +53,25 @@ def stuck_runs(values: Floats) -> list[tuple[int, int]]:
     return [(a + 1, b) for a, b in pairwise(ends.tolist()) if b - a >= LEAST_STUCK]
 
 
-def fault_of(node: str, force_mps2: Floats, down_camera: Floats | None) -> str | None:
+def fault_of(node: str, force_mps2: Floats, R_level_camera: Floats | None) -> str | None:
     """Say what is wrong with seconds of samples (N, 3), camera axes; None where nothing is, or too little is there.
 
-    down_camera (3,): where the node's attitude says down is.
+    R_level_camera (N, 3, 3): each sample's, by the node's attitudes. In axes that turn with a node gravity's mean is
+    small, and off the last attitude's.
     """
     if len(force_mps2) < 8:
         return None
+    if R_level_camera is not None:
+        force_mps2 = (R_level_camera @ force_mps2[:, :, None])[:, :, 0]
     mean = force_mps2.mean(axis=0)
     size = float(np.linalg.norm(mean))
-    if LIGHTEST_MPS2 / 9.80665 < size < HEAVIEST_MPS2 / 9.80665:
+    least = size if R_level_camera is not None else float(np.linalg.norm(force_mps2, axis=1).mean())
+    if LIGHTEST_MPS2 / 9.80665 < least < HEAVIEST_MPS2 / 9.80665:
         return f"node {node}: the accelerometer shows {size:.2f} m/s^2 over seconds: g in place of m/s^2; not used"
-    if not LIGHTEST_MPS2 < size < HEAVIEST_MPS2:
+    if least < LIGHTEST_MPS2 or size > HEAVIEST_MPS2:
         return f"node {node}: the accelerometer shows {size:.2f} m/s^2 over seconds, not gravity; not used"
-    if down_camera is not None:
-        angle = math.acos(max(-1.0, min(1.0, float(-mean @ down_camera) / size)))
+    if R_level_camera is not None:
+        angle = math.acos(max(-1.0, min(1.0, float(-mean[2]) / size)))
         if angle > MISMOUNTED_RAD:
             return (
                 f"node {node}: the accelerometer's gravity is {math.degrees(angle):.0f} deg off the attitude's: "
