@@ -298,6 +298,20 @@ def test_live_alarms_are_published_on_the_bus(messages):
             if parsed is None or parsed[0].name not in ("attitude", "depth", "imu", "pose"):
                 continue
             topic, ids = parsed
+@pytest.mark.parametrize("form", ["svx", "th"])
+def test_texts_of_several_lines_are_no_lines_of_data_in_other_programs_files(tmp_path, logs, form):
+    path, note = tmp_path / "cave.toml", "of two\nlines"
+    run("legs", path, "--dive", *logs)
+    text = path.read_text().replace('title = ""', 'title = "Lake\\n*fix 9 1 2 3"')
+    text = text.replace("team = []", 'team = ["A\\rB"]')
+    edit = '[[edit]]\nleg = "1-2"\nuse = false\nnote = """moved\n*require 9"""\n'
+    path.write_text(text.replace(MARKER, edit + MARKER).replace('name = "1"', f'name = "1"\nnotes = ["{note!r}"]', 1))
+    out = tmp_path / f"out.{form}"
+    assert run("export", path, "--format", form, "-o", out) == 0
+    lines = [line.strip() for line in out.read_text().splitlines()]
+    assert not [line for line in lines if line.startswith(("*fix 9", "*require", "lines", "B"))]
+
+
             if (topic, ids) not in publishers:
                 publishers[topic, ids] = nodes.publisher(topic, *ids)
             off = isinstance(message, Depth) and message.node == "b"

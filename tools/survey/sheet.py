@@ -67,6 +67,11 @@ def remark_on(leg: Leg) -> str:
     return " ".join(words + ["ALARM " + "; ".join(leg.alarms)] * bool(leg.alarms))
 
 
+def one_line(text: str) -> str:
+    """Return text on one line: what follows a line end would be a line of data in another program's file."""
+    return " ".join(text.splitlines())
+
+
 class Sheet:
     """An adjusted survey, ready to be written down."""
 
@@ -93,8 +98,8 @@ class Sheet:
         # A survey of the hierarchy has one name.
         self.name = re.sub(r"[^A-Za-z0-9_-]", "_", about.name) or "survey"
         self.name += f"_{OWN}" * (self.name in theirs)
-        self.title = about.title or about.name
-        self.team = about.team
+        self.title = one_line(about.title or about.name)
+        self.team = [one_line(person) for person in about.team]
         when = survey_date(project)
         # The stated date, or the first leg's; empty if there is none.
         self.date = when.strftime("%Y.%m.%d") if when else ""
@@ -110,10 +115,10 @@ class Sheet:
         grid = self.adjusted.grid
         if grid.declination is None:
             return "declination not known: north is magnetic"
-        readings = self.readings
+        readings, source = self.readings, one_line(grid.declination.source)
         if not readings:
-            return f"declination: {grid.declination.source}"
-        why = f"declination {_span([one.declination_deg for one in readings])} deg: {grid.declination.source}"
+            return f"declination: {source}"
+        why = f"declination {_span([one.declination_deg for one in readings])} deg: {source}"
         if grid.projection is None:
             return why
         convergences = [one.declination_deg - one.turn_deg for one in readings]
@@ -151,7 +156,7 @@ class Sheet:
         notes += [f"station {station.name}: {note}" for station in self.project.station for note in station.notes]
         for edit in self.project.edit:
             notes.append(f"leg {edit.leg}: {'' if edit.use else 'taken out; '}{edit.note}".rstrip("; "))
-        return notes
+        return list(map(one_line, notes))
 
     @property
     def fixed(self) -> Fixed:

@@ -22,7 +22,7 @@ from buddyline.tools.survey.old.writing import (
     therion_person,
     therion_system,
 )
-from buddyline.tools.survey.sheet import Reading, Sheet, remark_on
+from buddyline.tools.survey.sheet import Reading, Sheet, one_line, remark_on
 
 
 @dataclass(frozen=True)
@@ -225,7 +225,7 @@ def _svx_file(sheet: Sheet, body: list[str]) -> str:
     lines += [SURVEX.fix(name, *at) for name, at in fixed.items()]
     lines += [f"*entrance {name}" for name in sorted(sheet.entrances) if name in fixed]
     own_legs = sheet.readings or sheet.undirected
-    lines += [f"; left out: {leg.name} {leg.distance_m:.2f} m, {why}" for leg, why in sheet.adjusted.left_out]
+    lines += [f"; left out: {leg.name} {leg.distance_m:.2f} m, {one_line(why)}" for leg, why in sheet.adjusted.left_out]
     if sheet.olds and not own_legs:
         return "\n".join([*lines[: lines.index(f"*begin {sheet.name}")], *_svx_olds(sheet, grid), ""])
     return "\n".join([*lines, *body, f"*end {sheet.name}", *_svx_olds(sheet, grid), ""])

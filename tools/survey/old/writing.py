@@ -92,7 +92,7 @@ class _Names:
 
 def quoted(text: str) -> str:
     """Return text in quotes; quotes in it are replaced."""
-    return '"' + text.replace('"', "'").replace("\n", " ") + '"'
+    return '"' + " ".join(text.replace('"', "'").splitlines()) + '"'
 
 
 def therion_person(name: str) -> str:
