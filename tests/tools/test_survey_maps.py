@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.survey import maps
+from buddyline.tools.survey.geodesy import radii_m
 from buddyline.tools.survey.network import adjust
 from buddyline.tools.survey.old.joining import joined, named
 from buddyline.tools.survey.old.readers import read_old
 from buddyline.tools.survey.project import Equate, FixedPoint, Place
 from buddyline.tools.survey.sheet import Sheet
+from buddyline.tools.survey.tables import map_features, stations_csv
 
 from tests.tools import survey_world as world
 
@@ -54,6 +56,38 @@ def test_kml_has_every_station_and_leg_where_it_is(tmp_path):
     lines = root.findall(".//k:LineString/k:coordinates", space)
     assert len(lines) == 15
     assert all(len(line.text.split()) == 2 for line in lines)
+
+
+def test_a_survey_may_cross_the_meridian_where_180_and_minus_180_degrees_meet():
+    course = world.loop(np.random.default_rng(1), 14)
+    legs = world.readings_of(course, np.random.default_rng(1))
+    east_m = (course.stations_m[7] - course.stations_m[0])[1]
+    # At the equator: metres a degree of longitude.
+    per_deg_m = np.radians(radii_m(0.0)[0])
+    first_deg = np.copysign(180, east_m) - 0.5 * east_m / per_deg_m
+    last_deg = first_deg + east_m / per_deg_m
+    north_m = (course.stations_m[7] - course.stations_m[0])[0]
+    fixes = [
+        FixedPoint(station="0", latitude_deg=0.0, longitude_deg=float(first_deg), sigma_m=0.5),
+        FixedPoint(
+            station="7",
+            latitude_deg=float(np.degrees(north_m / radii_m(0.0)[1])),
+            longitude_deg=float(np.remainder(last_deg + 180, 360) - 180),
+            sigma_m=0.5,
+        ),
+    ]
+    assert fixes[0].longitude_deg * fixes[1].longitude_deg < 0
+    project = world.project_of(legs, place=Place(declination_deg=0.0), fix=fixes)
+    sheet = Sheet(project, adjust(project))
+    assert sheet.adjusted.fit.factor < 2
+    rows = list(csv.DictReader(io.StringIO(stations_csv(sheet))))
+    longitudes_deg = [float(row["longitude_deg"]) for row in rows]
+    assert min(longitudes_deg) < -179
+    assert max(longitudes_deg) > 179
+    for one in map_features(sheet):
+        if one["geometry"]["type"] == "LineString":
+            (start_deg, *_), (end_deg, *_) = one["geometry"]["coordinates"]
+            assert abs(end_deg - start_deg) < 0.001
 
 
 def test_a_map_of_nowhere_is_refused(tmp_path):

@@ -252,7 +252,7 @@ class Grid:
         per_longitude_m, per_latitude_m = radii_m(self.origin[0])
         return (
             self.origin[0] + math.degrees(north_m / per_latitude_m),
-            self.origin[1] + math.degrees(east_m / per_longitude_m),
+            math.remainder(self.origin[1] + math.degrees(east_m / per_longitude_m), 360),
         )
 
     @cached_property
@@ -272,7 +272,8 @@ class Grid:
             return 0.0, 0.0
         per_longitude_m, per_latitude_m = radii_m(self.origin[0])
         return (
-            math.radians(fix.degrees[1] - self.origin[1]) * per_longitude_m,
+            # Longitudes differ by less than half a turn, also where +180 and -180 degrees meet.
+            math.radians(math.remainder(fix.degrees[1] - self.origin[1], 360)) * per_longitude_m,
             math.radians(fix.degrees[0] - self.origin[0]) * per_latitude_m,
         )
 

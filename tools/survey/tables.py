@@ -164,14 +164,20 @@ def map_features(sheet: Sheet) -> list[dict[str, Any]]:
         add("Point", where, {name: row[name] if n is None else round(row[name], n) for name, n in digits.items()})
     for leg, names in sheet.adjusted.survey.stations_legs:
         properties = {"name": leg.name, "kind": "leg", "distance_m": leg.distance_m, "grade": leg.grade}
-        add("LineString", [at[name] for name in names], properties | {"alarms": leg.alarms})
+        add("LineString", _unbroken([at[name] for name in names]), properties | {"alarms": leg.alarms})
     for path in sheet.adjusted.paths:
         for part_m in path.parts:
             degrees = [sheet.adjusted.grid.degrees(place_m) or (0.0, 0.0) for place_m in part_m]
             heights_m = part_m[:, 2].tolist()
             line = [[round(e, 8), round(n, 8), round(z, 3)] for (n, e), z in zip(degrees, heights_m, strict=True)]
-            add("LineString", line, {"name": path.swim.name, "kind": "path"})
+            add("LineString", _unbroken(line), {"name": path.swim.name, "kind": "path"})
     return features
+
+
+def _unbroken(line: list[list[float]]) -> list[list[float]]:
+    """Return a line's places with longitudes beyond 180 degrees where it crosses that meridian: no map goes about."""
+    first_deg = line[0][0]
+    return [[round(first_deg + math.remainder(e_deg - first_deg, 360), 8), *rest] for e_deg, *rest in line]
 
 
 def geojson(sheet: Sheet) -> str:
