@@ -18,7 +18,7 @@ from buddyline.protocol.messages import Depth, Imu, Mark, NodeInfo, Rejected, Re
 from buddyline.protocol.topics import INFO, MARK, key_of, parse_key
 from buddyline.tools.survey import command, mark
 from buddyline.tools.survey.live import Watch
-from buddyline.tools.survey.marks import section_of
+from buddyline.tools.survey.marks import of_table, section_of
 from buddyline.tools.survey.old.model import CrossSection
 from buddyline.tools.survey.project import MARKER, Station, load_project
 from msgspec.structs import replace
@@ -86,6 +86,26 @@ def test_exports_and_reports_refuse_to_overwrite(tmp_path, logs, words):
         with pytest.raises(BuddylineError, match=f"{precious.name}: exists"):
             run(words[0], path, *words[1:], "-o", precious)
         assert precious.read_bytes() == before
+
+
+def test_line_ends_links_and_permissions_of_a_project_stay(tmp_path, logs):
+    path, link = tmp_path / "cave.toml", tmp_path / "linked.toml"
+    run("legs", path, "--dive", *logs)
+    # An editor of Windows: its line ends, and a byte order mark.
+    text = "\ufeff" + path.read_text().replace("[place]", '[place]\ndeclination_source = "ça"')
+    path.write_bytes(text.replace("\n", "\r\n").encode())
+    path.chmod(0o640)
+    link.symlink_to(path.name)
+    before = path.read_bytes().split(MARKER.encode())[0]
+    path.write_bytes(before)
+    assert run("legs", link) == 0
+    assert link.is_symlink()
+    assert path.stat().st_mode & 0o777 == 0o640
+    after = path.read_bytes()
+    assert after.startswith(before)
+    assert after.count(b"\n") == after.count(b"\r\n")
+    assert len(load_project(path).leg) == 3
+    assert sorted(file.name for file in tmp_path.glob("*.toml*")) == ["cave.toml", "linked.toml"]
 
 
 def test_hand_written_text_stays_and_the_old_file_is_kept(tmp_path, logs):
@@ -204,11 +224,46 @@ def test_marks_from_a_table_and_from_the_project(tmp_path, logs):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
+        ("time,node\nnan,a\n", "line 2: time 'nan': not a finite number"),
+        ("time,node\n1e30,a\n", "line 2: .*seconds"),
+        ("time,node\n9999-12-31T23:59:59-10:00,a\n", "line 2: time 9999.*1970 to 2261"),
+        ("time,node\nnoon,a\n", "line 2: time 'noon': neither as"),
+        ("time,node,dive\n1,a,2\n", "line 2: dive = 2: the project has 1"),
+        ("when,who\n1,a\n", "line 1: no column time and node; columns: time, node, name, kind, note, dive"),
+        ("", "line 1: no column time and node"),
+    ],
+)
+def test_a_bad_table_of_marks_is_refused_and_named(tmp_path, text, said):
+    path = tmp_path / "times.csv"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=said):
+        of_table(path, 1)
+
+
+def test_a_table_of_marks_may_be_of_several_dives_and_have_blanks_in_its_head(tmp_path):
+    path = tmp_path / "times.csv"
+    path.write_text("Time, Node, Name, Dive\n1.5, a, X, 2\n2.5, b, Y,\n")
+    assert [(mark.seconds, mark.node, mark.name, mark.dive) for mark in of_table(path, 2)] == [
+        (1.5, "a", "X", 2),
+        (2.5, "b", "Y", 1),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
         ("[survey]\nnmae = 'x'\n", "did you mean `name`"),
         ("[[fix]]\nstation = '0'\neast_m = 1.0\n", "east_m and north_m"),
         ("[settings]\nrest_s = -1.0\n", "rest_s"),
         ("[[leg]]\n", "leg"),
         ("[place]\nutm_zone = 'abc'\n", "utm_zone"),
+        ("[place]\nlatitude_deg = 45.0\n", "give both latitude_deg and longitude_deg"),
+        ("[[fix]]\nstation = '0'\neast_m = 1.0\nnorth_m = 1.0\nlatitude_deg = 45.0\n", "east_m and north_m"),
+        ("[[fix]]\nstation = '0'\nlatitude_deg = 945.0\nlongitude_deg = 9.0\n", r"fix\[0\].latitude_deg = 945.0"),
+        ("[[mark]]\nnode = 'a'\nname = 'X'\n", "bad.toml: mark 'X' of node a: give time or seconds"),
+        ("[[mark]]\nnode = 'a'\nname = 'X'\nseconds = 1.0\ntime = 2026-05-01T10:00:00Z\n", "and not both"),
+        ("[[mark]]\nnode = 'a'\nname = 'X'\nseconds = 1.0\ndive = 2\n", r"dive = 2: the project has 0 \[\[dive\]\]"),
+        ("[[mark]]\nnode = 'a'\nseconds = 1e30\n", r"mark\[0\].seconds = 1e\+30"),
     ],
 )
 def test_a_bad_project_is_refused_and_named(tmp_path, text, said):
@@ -243,6 +298,20 @@ def test_notes_may_contain_any_character(tmp_path, logs, messages):
     assert note in load_project(path).station[0].notes
 
 
+@pytest.mark.parametrize("form", ["svx", "th"])
+def test_texts_of_several_lines_are_no_lines_of_data_in_other_programs_files(tmp_path, logs, form):
+    path, note = tmp_path / "cave.toml", "of two\nlines"
+    run("legs", path, "--dive", *logs)
+    text = path.read_text().replace('title = ""', 'title = "Lake\\n*fix 9 1 2 3"')
+    text = text.replace("team = []", 'team = ["A\\rB"]')
+    edit = '[[edit]]\nleg = "1-2"\nuse = false\nnote = """moved\n*require 9"""\n'
+    path.write_text(text.replace(MARKER, edit + MARKER).replace('name = "1"', f'name = "1"\nnotes = ["{note!r}"]', 1))
+    out = tmp_path / f"out.{form}"
+    assert run("export", path, "--format", form, "-o", out) == 0
+    lines = [line.strip() for line in out.read_text().splitlines()]
+    assert not [line for line in lines if line.startswith(("*fix 9", "*require", "lines", "B"))]
+
+
 def mark_arguments(*words):
     parser = argparse.ArgumentParser()
     mark.add_arguments(parser)
@@ -255,7 +324,8 @@ def test_a_mark_by_command():
     later = mark.mark_of(mark_arguments("T1", "--node", "a", "--at", "2026-05-01T10:00:00Z"), 5)
     assert later.stamp_ns == world.START_NS
     assert parse_key(key_of(said))[0] is MARK
-    for words in (("T 1", "--node", "a"), ("--node", "a", "--kind", "note"), ("T1", "--node", "A")):
+    far = ("T1", "--node", "a", "--at", "1e30"), ("T1", "--node", "a", "--at", "0900-01-01")
+    for words in (("T 1", "--node", "a"), ("--node", "a", "--kind", "note"), ("T1", "--node", "A"), *far):
         with pytest.raises(BuddylineError):
             mark.mark_of(mark_arguments(*words), 5)
 
@@ -298,20 +368,6 @@ def test_live_alarms_are_published_on_the_bus(messages):
             if parsed is None or parsed[0].name not in ("attitude", "depth", "imu", "pose"):
                 continue
             topic, ids = parsed
-@pytest.mark.parametrize("form", ["svx", "th"])
-def test_texts_of_several_lines_are_no_lines_of_data_in_other_programs_files(tmp_path, logs, form):
-    path, note = tmp_path / "cave.toml", "of two\nlines"
-    run("legs", path, "--dive", *logs)
-    text = path.read_text().replace('title = ""', 'title = "Lake\\n*fix 9 1 2 3"')
-    text = text.replace("team = []", 'team = ["A\\rB"]')
-    edit = '[[edit]]\nleg = "1-2"\nuse = false\nnote = """moved\n*require 9"""\n'
-    path.write_text(text.replace(MARKER, edit + MARKER).replace('name = "1"', f'name = "1"\nnotes = ["{note!r}"]', 1))
-    out = tmp_path / f"out.{form}"
-    assert run("export", path, "--format", form, "-o", out) == 0
-    lines = [line.strip() for line in out.read_text().splitlines()]
-    assert not [line for line in lines if line.startswith(("*fix 9", "*require", "lines", "B"))]
-
-
             if (topic, ids) not in publishers:
                 publishers[topic, ids] = nodes.publisher(topic, *ids)
             off = isinstance(message, Depth) and message.node == "b"

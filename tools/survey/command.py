@@ -80,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--marks",
         type=Path,
         metavar="TIMES.csv",
-        help="which node was where when; columns: time, node, name, and optionally kind and note",
+        help="which node was where when; columns: time, node, name, and optionally kind, note and dive (default: 1)",
     )
     imported = add(
         "take in surveys of other programs: they are adjusted with the project's own legs",
@@ -166,7 +166,7 @@ def _legs(args: argparse.Namespace) -> int:
     project = load_project(path)
     if not project.dive:
         raise BuddylineError(f"{path}: names no dive; add [[dive]] with its logs")
-    marks = project.mark + (of_table(args.marks) if args.marks else [])
+    marks = project.mark + (of_table(args.marks, len(project.dive)) if args.marks else [])
     derived = Derived()
     for number, one in enumerate(project.dive, 1):
         pairs = of_logs([str(path.parent / log) for log in one.logs])

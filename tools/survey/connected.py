@@ -108,6 +108,8 @@ class Survey:
         for one in project.known:
             if missing := {one.from_, one.to} - stations:
                 raise ConfigError(f"known line {one.from_}-{one.to}: no leg has station {', '.join(sorted(missing))}")
+            if one.from_ == one.to:
+                raise ConfigError(f"known line {one.from_}-{one.to}: both ends are one station")
             if one.distance_m is UNSET and one.azimuth_deg is UNSET:
                 raise ConfigError(f"known line {one.from_}-{one.to}: give distance_m, azimuth_deg or both")
         azimuths = any(one.azimuth_deg is not UNSET for one in project.known)

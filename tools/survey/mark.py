@@ -14,7 +14,7 @@ from buddyline.protocol.topics import MARK, check_node_id
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.live import LiveClient
 from buddyline.tools.survey.marks import KINDS, section_note, stamp_ns_of, time_of
-from buddyline.tools.survey.project import STATION_NAME
+from buddyline.tools.survey.project import STATION_NAME, YEARS
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus
@@ -56,6 +56,8 @@ def mark_of(args: argparse.Namespace, now_ns: int) -> Mark:
         stamp_ns = stamp_ns_of(time_of(args.at), now_ns) if args.at else now_ns
     except ValueError as error:
         raise BuddylineError(f"--at {args.at}: {error}") from error
+    if not 0 <= stamp_ns < 2**63:
+        raise BuddylineError(f"--at {args.at}: is not within the years {YEARS[0]} to {YEARS[-1]}")
     if args.lrud and args.kind != "station":
         raise BuddylineError(f"--lrud is of a station, not of a {args.kind}")
     note = section_note(args.lrud, args.note) if args.lrud else args.note

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -15,13 +16,16 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Mark
-from buddyline.tools.survey.project import HandMark, MarkKind, Station
+from buddyline.tools.survey.project import HandMark, MarkKind, Station, check_mark
 from msgspec import UNSET
 
 if TYPE_CHECKING:
     from buddyline.tools.survey.old.model import CrossSection
 
 KINDS: Final = get_args(MarkKind)
+# The columns of a table of marks.
+TEXTS: Final = ("node", "name", "kind", "note")
+COLUMNS: Final = ("time", *TEXTS, "dive")
 # How a station's note says its cross-section: left, right, up, down in metres, - for what was not measured.
 SECTION_WORD: Final = "LRUD"
 
@@ -56,9 +60,15 @@ def _is_length(word: str) -> bool:
 def time_of(text: str) -> datetime | float:
     """Return `2026-05-01T10:20:30Z` as a time (UTC if no zone is given), or a number of seconds; else ValueError."""
     try:
-        return float(text)
+        seconds = float(text)
     except ValueError:
-        return datetime.fromisoformat(text.strip())
+        try:
+            return datetime.fromisoformat(text.strip())
+        except ValueError as error:
+            raise ValueError(f"time {text!r}: neither as 2026-05-01T10:20:30Z nor a number of seconds") from error
+    if not math.isfinite(seconds):
+        raise ValueError(f"time {text!r}: not a finite number")
+    return seconds
 
 
 def stamp_ns_of(time: datetime | float, start_ns: int) -> int:
@@ -74,16 +84,17 @@ def of_project(marks: list[HandMark], dive: int, start_ns: int) -> list[Mark]:
     result = []
     for mark in marks:
         time = mark.seconds if mark.time is UNSET else mark.time
-        if time is UNSET:
-            raise ConfigError(f"mark {mark.name!r} of node {mark.node}: give time or seconds")
-        if mark.dive == dive:
+        if mark.dive == dive and time is not UNSET:
             stamp_ns = stamp_ns_of(time, start_ns)
             result.append(Mark(node=mark.node, stamp_ns=stamp_ns, kind=mark.kind, name=mark.name, note=mark.note))
     return result
 
 
-def of_table(path: Path) -> list[HandMark]:
-    """Read a CSV of the first dive's marks with the columns time, node, name, and optionally kind and note."""
+def of_table(path: Path, dives: int = 1) -> list[HandMark]:
+    """Read a CSV with the columns time and node, and optionally name, kind, note, and dive (1 where it is not said).
+
+    Raises ConfigError naming file, line and value. dives: how many there are.
+    """
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             text = file.read()
@@ -94,14 +105,22 @@ def of_table(path: Path) -> list[HandMark]:
     # Spreadsheets write semicolons or tabs where a comma is the decimal point.
     head = text.partition("\n")[0]
     delimiter = max(",;\t", key=head.count)
+    rows = csv.DictReader(io.StringIO(text), delimiter=delimiter)
+    rows.fieldnames = [name.strip().lower() for name in rows.fieldnames or ()]
+    if missing := [name for name in ("time", "node") if name not in rows.fieldnames]:
+        raise ConfigError(f"{path}: line 1: no column {' and '.join(missing)}; columns: {', '.join(COLUMNS)}")
     marks = []
-    for number, row in enumerate(csv.DictReader(io.StringIO(text), delimiter=delimiter), 2):
-        given = {name: row[name].strip() for name in ("node", "kind", "name", "note") if row.get(name)}
+    for row in rows:
+        where = f"{path}: line {rows.line_num}"
+        given: dict[str, object] = {name: row[name].strip() for name in TEXTS if row.get(name)}
         try:
-            text_of_time = (row.get("time") or "").strip()
+            text_of_time = (row["time"] or "").strip()
             time = time_of(text_of_time.replace(",", ".") if delimiter != "," else text_of_time)
-            when = {"seconds": time} if isinstance(time, float) else {"time": time}
-            marks.append(msgspec.convert(given | when, HandMark))
+            given |= {"seconds": time} if isinstance(time, float) else {"time": time}
+            if number := (row.get("dive") or "").strip():
+                given["dive"] = int(number)
+            marks.append(msgspec.convert(given, HandMark))
         except ValueError as error:
-            raise ConfigError(f"{path}: line {number}: {error}") from error
+            raise ConfigError(f"{where}: {error}") from error
+        check_mark(marks[-1], where, dives)
     return marks

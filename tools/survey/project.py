@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import re
+import shutil
 from collections.abc import Sequence
 from datetime import UTC, date, datetime
 from itertools import count
@@ -19,6 +20,7 @@ from typing import Annotated, Any, Final, Literal, TypeAlias
 import msgspec
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import Config, ConfigError, load_config
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NodeId, NonNegative, Positive
 from buddyline.tools.newfile import write_new
 from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
@@ -26,6 +28,13 @@ from msgspec import UNSET, Meta, UnsetType, field
 
 MARKER: Final = "# ---- From the dives, by `buddyline survey legs`: made anew each time. Edit above. ----"
 STATION_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,12}\Z")
+# The years whose instants are counts of nanoseconds in 64 bits.
+YEARS: Final = range(1970, 2262)
+# No dive is so long.
+MOST_S: Final = 1e6
+
+Latitude: TypeAlias = Annotated[float, Meta(ge=-90, le=90)]
+Longitude: TypeAlias = Annotated[float, Meta(ge=-180, le=180)]
 
 
 class About(Config, frozen=True, kw_only=True):
@@ -44,8 +53,8 @@ class Place(Config, frozen=True, kw_only=True):
     is 0; by default from the first fix's altitude and its station's depth, or 0. utm_zone ("32N") or epsg (any
     projected coordinate system in metres to east and north, such as 2154): the map grid of all coordinates."""
 
-    latitude_deg: Annotated[float, Meta(ge=-90, le=90)] | UnsetType = UNSET
-    longitude_deg: Annotated[float, Meta(ge=-180, le=180)] | UnsetType = UNSET
+    latitude_deg: Latitude | UnsetType = UNSET
+    longitude_deg: Longitude | UnsetType = UNSET
     water_level_m: float | UnsetType = UNSET
     declination_deg: float | UnsetType = UNSET
     declination_source: str = ""
@@ -68,8 +77,8 @@ class FixedPoint(Config, frozen=True, kw_only=True):
     station: str
     east_m: float | UnsetType = UNSET
     north_m: float | UnsetType = UNSET
-    latitude_deg: float | UnsetType = UNSET
-    longitude_deg: float | UnsetType = UNSET
+    latitude_deg: Latitude | UnsetType = UNSET
+    longitude_deg: Longitude | UnsetType = UNSET
     altitude_m: float | UnsetType = UNSET
     sigma_m: NonNegative = 0.0
     altitude_sigma_m: NonNegative = 0.0
@@ -84,6 +93,11 @@ class FixedPoint(Config, frozen=True, kw_only=True):
     def metres(self) -> tuple[float, float] | None:
         """East and north, where both are given."""
         return _pair(self.east_m, self.north_m)
+
+
+def _half(one: float | UnsetType, other: float | UnsetType) -> bool:
+    """Return whether only one of two coordinates is given."""
+    return (one is UNSET) != (other is UNSET)
 
 
 def _pair(one: float | UnsetType, other: float | UnsetType) -> tuple[float, float] | None:
@@ -106,7 +120,7 @@ class HandMark(Config, frozen=True, kw_only=True):
 
     node: NodeId
     time: datetime | UnsetType = UNSET
-    seconds: float | UnsetType = UNSET
+    seconds: Annotated[float, Meta(ge=-MOST_S, le=MOST_S)] | UnsetType = UNSET
     dive: Annotated[int, Meta(ge=1)] = 1
     kind: MarkKind = "station"
     name: str = ""
@@ -337,11 +351,16 @@ class Project(Config, frozen=True, kw_only=True):
 def load_project(path: Path | str) -> Project:
     """Read a project file; raise ConfigError naming file, field and value."""
     project = load_config(path, Project)
+    if _half(project.place.latitude_deg, project.place.longitude_deg):
+        raise ConfigError(f"{path}: place: give both latitude_deg and longitude_deg, or neither")
     for fix in project.fix:
-        if (fix.metres is None) == (fix.degrees is None):
+        half = _half(fix.east_m, fix.north_m) or _half(fix.latitude_deg, fix.longitude_deg)
+        if half or (fix.metres is None) == (fix.degrees is None):
             raise ConfigError(
                 f"{path}: fix of {fix.station!r}: give east_m and north_m, or latitude_deg and longitude_deg"
             )
+    for mark in project.mark:
+        check_mark(mark, f"{path}: mark {mark.name!r} of node {mark.node}", len(project.dive))
     fixed = [fix.station for fix in project.fix]
     if twice := {name for name in fixed if fixed.count(name) > 1}:
         raise ConfigError(f"{path}: fix of {min(twice)!r}: is stated twice; give one place, or their mean")
@@ -351,6 +370,16 @@ def load_project(path: Path | str) -> Project:
         if names and edit.leg not in names and not project.old:
             raise ConfigError(f"{path}: edit of leg {edit.leg!r}: no such leg; known: {', '.join(sorted(names))}")
     return project
+
+
+def check_mark(mark: HandMark, name: str, dives: int) -> None:
+    """Raise ConfigError, with the mark's name, if it has no instant, or is of none of so many dives."""
+    if (mark.time is UNSET) == (mark.seconds is UNSET):
+        raise ConfigError(f"{name}: give time or seconds, and not both")
+    if mark.time is not UNSET and mark.time.year not in YEARS:
+        raise ConfigError(f"{name}: time {mark.time.isoformat()}: its year is not within {YEARS[0]} to {YEARS[-1]}")
+    if mark.dive > dives:
+        raise ConfigError(f"{name}: dive = {mark.dive}: the project has {dives} [[dive]]")
 
 
 def own_equates(project: Project) -> list[list[str]]:
@@ -367,9 +396,9 @@ def sources_of(project: Project) -> str:
 
 def write_derived(path: Path, derived: dict[str, list[Any]]) -> None:
     """Write the derived part below the marker; keep the old file as `NAME.1`, `NAME.2`, ..."""
-    old = path.read_text(encoding="utf-8")
-    upper = old.split(MARKER)[0].rstrip("\n")
-    text = f"{upper}\n\n{MARKER}\n{_toml(derived)}"
+    old = _text_of(path)
+    upper = old.split(MARKER)[0].rstrip("\r\n")
+    text = upper + _ends_as(old, f"\n\n{MARKER}\n{_toml(derived)}")
     if text == old:
         return
     _write_again(path, text, old if MARKER in old else "")
@@ -377,18 +406,37 @@ def write_derived(path: Path, derived: dict[str, list[Any]]) -> None:
 
 def add_old(path: Path, added: list[OldFile]) -> None:
     """Add old surveys to the upper part; keep the file as it was as `NAME.1`, `NAME.2`, ..."""
-    old = path.read_text(encoding="utf-8")
+    old = _text_of(path)
     upper, marker, lower = old.partition(MARKER)
-    _write_again(path, f"{upper.rstrip()}\n{_toml({'old': added})}\n{marker}{lower}".rstrip() + "\n", old)
+    tables = _ends_as(old, f"\n{_toml({'old': added})}\n")
+    _write_again(path, f"{upper.rstrip()}{tables}{marker}{lower}".rstrip() + _ends_as(old, "\n"), old)
+
+
+def _text_of(path: Path) -> str:
+    """Return a file's text with its own line ends, which differ between systems."""
+    return path.read_bytes().decode()
+
+
+def _ends_as(old: str, text: str) -> str:
+    """Return text, which has newlines, with the line ends of an old text."""
+    return text.replace("\n", "\r\n") if "\r\n" in old else text
 
 
 def _write_again(path: Path, text: str, old: str) -> None:
+    """Replace a file, or the one that a link leads to; it keeps its permissions. old: what to keep; "" for nothing."""
     if old:
         numbered = (path.with_name(f"{path.name}.{number}") for number in count(1))
         write_new(next(kept for kept in numbered if not kept.exists()), old)
-    fresh = path.with_name(f"{path.name}.new")
-    fresh.write_text(text, encoding="utf-8")
-    os.replace(fresh, path)
+    target = path.resolve()
+    fresh = target.with_name(f"{target.name}.{os.getpid()}.new")
+    try:
+        fresh.write_bytes(text.encode())
+        shutil.copymode(target, fresh)
+        os.replace(fresh, target)
+    except OSError as error:
+        raise BuddylineError(f"{path}: cannot be written: {error.strerror}") from error
+    finally:
+        fresh.unlink(missing_ok=True)
 
 
 def new_project(path: Path, name: str, logs: list[str], old: Sequence[OldFile] = ()) -> None:
