@@ -32,7 +32,8 @@ def load_config(path: Path | str, schema: type[C]) -> C:
     """Read a TOML file as schema; raise ConfigError naming file, field and value."""
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        # Editors of Windows may put a byte order mark before the text.
+        text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:

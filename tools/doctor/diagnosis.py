@@ -33,7 +33,7 @@ def load(path: str | None) -> tuple[NodeConfig | None, ClientConfig]:
     if path is None:
         return None, ClientConfig()
     try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        table = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except (OSError, ValueError):
         table = {"node": ""}  # load_node_config reports what is wrong with the file
     if "node" not in table:
