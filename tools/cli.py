@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import errno
 import gc
 import os
 import sys
@@ -16,6 +17,8 @@ from buddyline.protocol import __version__
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.losses import collected
 
+# What the system says where no more can be written, by no fault of the program.
+NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
 SUMMARY: Final = "Two or more underwater nodes see each other's lights; Buddyline says where they are."
 
 
@@ -280,10 +283,39 @@ def main(argv: list[str] | None = None) -> int:
     0 done, 1 a check failed or input was damaged, 2 a known error, 130 interrupted.
     """
     words = sys.argv[1:] if argv is None else argv
+    # Of a closed one there is none, and the next file that is opened has its number.
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))
     # On a terminal or pipe limited to ASCII, other characters become "?"; there is no traceback.
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")
+    status = 0
+    try:
+        try:
+            status = _run(words)
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader of our output has gone (as `head` does): say nothing.
+        _drop_output()
+    except OSError as error:
+        if error.errno not in NO_ROOM:
+            raise
+        _drop_output()
+        print(f"{' '.join(['buddyline', *words[:1]])}: output cannot be written: {error.strerror}", file=sys.stderr)
+        status = 2
+    return status
+
+
+def _drop_output() -> None:
+    """Let what is left of standard output go nowhere, also what is flushed at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _run(words: list[str]) -> int:
+    """Run the command that the first word names; return the exit status."""
     if not words or words[0] in ("-h", "--help", "help"):
         print(overview())
         return 0
@@ -314,10 +346,6 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         return 130
-    except BrokenPipeError:
-        # The reader of our output has gone (as `head` does): say nothing, and flush nothing at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
 
 
 if __name__ == "__main__":

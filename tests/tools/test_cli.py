@@ -19,7 +19,7 @@ from buddyline.tools.cli import COMMANDS, main
 from buddyline.tools.solve import Tracked, _clock_words
 from msgspec.structs import replace
 
-from tests.processes import buddyline
+from tests.processes import PATIENCE_S, buddyline
 from tests.solver_service.conftest import dive_messages
 from tests.tools.evaluated import track
 
@@ -249,6 +249,28 @@ def test_a_configuration_typo_is_named(capsys, tmp_path):
     assert status == 2
     for word in ("a.toml", "nmae", "name"):
         assert word in err
+
+
+@pytest.mark.parametrize("words", [["--help"], ["completion", "bash"]])
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_full_disk_or_a_closed_pipe_at_the_output_is_no_traceback(words, unbuffered):
+    environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
+    program = [sys.executable, "-P", "-m", "buddyline", *words]
+    with open("/dev/full", "w") as full:
+        ended = subprocess.run(
+            program, stdout=full, stderr=subprocess.PIPE, text=True, env=environment, check=False, timeout=PATIENCE_S
+        )
+    assert (ended.returncode, ended.stderr.count("\n")) == (2, 1)
+    assert "output cannot be written: No space left on device" in ended.stderr
+    read, write = os.pipe()
+    os.close(read)
+    ended = subprocess.run(
+        program, stdout=write, stderr=subprocess.PIPE, text=True, env=environment, check=False, timeout=PATIENCE_S
+    )
+    os.close(write)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    closed = subprocess.run(["sh", "-c", '"$@" >&- 2>&-', "sh", *program], check=False, timeout=PATIENCE_S)
+    assert closed.returncode == 0
 
 
 EVERY_HELP = """
