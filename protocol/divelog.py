@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from itertools import chain
 from pathlib import Path
+from stat import S_ISREG
 from typing import IO, Final, cast
 
 import msgspec
@@ -104,7 +105,9 @@ class DiveLogWriter:
         self._cut_ns: int | None = None
         self.count = 0
         if metadata:
-            self._writer.add_metadata(LOG_NOTE, metadata)
+            # A file's name need not be UTF-8.
+            notes = {name: note.encode(errors="replace").decode() for name, note in metadata.items()}
+            self._writer.add_metadata(LOG_NOTE, notes)
         # With the head on the disk, a power cut in the first second leaves a readable log. A full disk is reported by
         # the next flush.
         with suppress(OSError):
@@ -225,7 +228,11 @@ class DiveLogReader:
         if self.path.is_dir():
             raise BuddylineError(f"{self.path}: is a folder; name the logs in it: {self.path / '*.mcap'}")
         try:
-            self._size = self.path.stat().st_size
+            about = self.path.stat()
+            if not S_ISREG(about.st_mode):
+                once = "is a pipe or a device, and a log is read more than once; copy it into a file, and name that"
+                raise BuddylineError(f"{self.path}: {once}")
+            self._size = about.st_size
             self._file = open(self.path, "rb")
         except OSError as error:
             raise BuddylineError(f"{self.path}: cannot be read: {error.strerror}") from error

@@ -61,10 +61,15 @@ def new_file(path: Path | str, hint: str = REMOVE_IT) -> Iterator[Path]:
             part.unlink(missing_ok=True)
 
 
+def as_bytes(content: str | bytes) -> bytes:
+    """Return text as UTF-8; what is none, as a file's name may be, becomes "?"."""
+    return content.encode(errors="replace") if isinstance(content, str) else content
+
+
 def write_new(path: Path | str, content: str | bytes, hint: str = REMOVE_IT) -> None:
     """Write a new file; raise BuddylineError as new_file does."""
     with new_file(path, hint) as part:
-        part.write_bytes(content.encode() if isinstance(content, str) else content)
+        part.write_bytes(as_bytes(content))
 
 
 def write_output(target: str, content: str | bytes) -> None:
@@ -73,7 +78,7 @@ def write_output(target: str, content: str | bytes) -> None:
         write_new(target, content)
         print(f"wrote {target}", file=sys.stderr)
         return
-    sys.stdout.buffer.write(content.encode() if isinstance(content, str) else content)
+    sys.stdout.buffer.write(as_bytes(content))
     sys.stdout.flush()
 
 

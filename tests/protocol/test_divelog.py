@@ -302,3 +302,9 @@ def test_an_image_stamp_is_its_publish_time(tmp_path):
 def test_a_folder_in_place_of_a_log_says_what_to_name(tmp_path):
     with pytest.raises(BuddylineError, match=r"is a folder; name the logs in it: .*\*\.mcap"):
         DiveLogReader(tmp_path)
+
+
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(BuddylineError, match=r"pipe: is a pipe or a device, .* copy it into a file"):
+        DiveLogReader(tmp_path / "pipe")

@@ -98,3 +98,13 @@ def test_a_log_gets_its_name_only_when_it_is_complete(tmp_path):
     with DiveLogReader(tmp_path / "a.mcap") as reader:
         assert [record.open().message for record in reader.records()] == [DEPTH]
         assert (reader.damage, reader.metadata()) == ([], {"command": "test"})
+
+
+def test_a_name_that_is_not_utf_8_may_be_in_a_text_and_in_a_log_s_notes(tmp_path):
+    name = os.fsdecode(b"caf\xe9.mcap")
+    write_new(tmp_path / "text", f"of {name}")
+    assert (tmp_path / "text").read_text() == "of caf?.mcap"
+    with new_dive_log(tmp_path / name, {"repaired_from": name}) as writer:
+        writer.write_message(DEPTH)
+    with DiveLogReader(tmp_path / name) as reader:
+        assert reader.metadata() == {"repaired_from": "caf?.mcap"}

@@ -3,6 +3,7 @@
 import argparse
 import csv
 import json
+import os
 import threading
 import time
 
@@ -281,6 +282,10 @@ def test_known_errors_are_reported(tmp_path, logs):
     path.write_text(path.read_text().replace(MARKER, f'[[edit]]\nleg = "7-8"\nuse = false\n\n{MARKER}'))
     with pytest.raises(ConfigError, match="no such leg"):
         run("adjust", path)
+    latin = os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.mcap")
+    with pytest.raises(BuddylineError, match=r"not UTF-8 text, .* rename the file"):
+        run("legs", tmp_path / "latin.toml", "--dive", latin)
+    assert not (tmp_path / "latin.toml").exists()
     empty = tmp_path / "empty.toml"
     empty.write_text("[survey]\n")
     with pytest.raises(BuddylineError, match="names no dive"):

@@ -406,6 +406,8 @@ def write_derived(path: Path, derived: dict[str, list[Any]]) -> None:
 
 def add_old(path: Path, added: list[OldFile]) -> None:
     """Add old surveys to the upper part; keep the file as it was as `NAME.1`, `NAME.2`, ..."""
+    for one in added:
+        _check_unicode(one.file)
     old = _text_of(path)
     upper, marker, lower = old.partition(MARKER)
     tables = _ends_as(old, f"\n{_toml({'old': added})}\n")
@@ -441,9 +443,17 @@ def _write_again(path: Path, text: str, old: str) -> None:
 
 def new_project(path: Path, name: str, logs: list[str], old: Sequence[OldFile] = ()) -> None:
     """Write a project file to fill in; raise BuddylineError if one exists."""
+    for each in (name, *logs, *(one.file for one in old)):
+        _check_unicode(each)
     text = TEMPLATE.format(name=_toml_value(name))
     text += f"\n[[dive]]\nlogs = {_toml_value(logs)}\n" * bool(logs) + (_toml({"old": list(old)}) if old else "")
     write_new(path, text, hint="add the dive to it as another [[dive]]")
+
+
+def _check_unicode(name: str) -> None:
+    """Raise BuddylineError if a file's name, which goes into the project, is no UTF-8."""
+    if any("\ud800" <= letter <= "\udfff" for letter in name):
+        raise BuddylineError(f"{name}: this name is not UTF-8 text, as a project file is; rename the file")
 
 
 TEMPLATE: Final = """\
