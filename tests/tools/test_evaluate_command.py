@@ -13,6 +13,7 @@ from buddyline.protocol.messages import Candidates, NodeInfo, NodePose, Truth
 from buddyline.tools.cli import main
 from buddyline.tools.evaluation.lights import Blobs, is_right_pair, true_lights
 from buddyline.tools.evaluation.truth import TruthTrack, inverted
+from msgspec.structs import replace
 
 from tests.tools.evaluated import (
     FIRST,
@@ -310,3 +311,13 @@ def test_other_rigs_are_projected_with_their_own_lights():
     lights = true_lights(("a", "b"), [frame("a", 0), frame("b", 0)], [], narrow, TruthTrack([truth(0)]))
     assert lights["a", FIRST].pixels[0, 0] == pytest.approx(409.5 + 904.0 * 0.22 / 3.0)
     assert lights["b", FIRST].pixels[0, 0] == pytest.approx(409.5 + 904.0 * 0.44 / 3.0)
+
+
+def test_a_truth_that_stands_in_two_logs_is_as_one():
+    truths = [replace(truth(k), t_a_b_m=(0.1 * k**2, 0.0, 2.0)) for k in range(5)]
+    between_ns = truths[2].stamp_ns + (truths[3].stamp_ns - truths[2].stamp_ns) // 2
+    # The cubic through four samples; a straight line gives 0.65 m.
+    t_m, _ = TruthTrack(truths).interpolated(between_ns)
+    assert t_m[0] == pytest.approx(0.625, abs=1e-9)
+    twice, _ = TruthTrack([*truths, *truths]).interpolated(between_ns)
+    assert twice.tolist() == t_m.tolist()

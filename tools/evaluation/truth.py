@@ -41,11 +41,15 @@ class PoseHistory:
     """Rotations, and positions if there are any, over time.
 
     Between samples runs the cubic through the two before and the two after. A straight line would not do: at 5 truths a
-    second a diver's swell bends it by centimetres, ten times what a track is off.
+    second a diver's swell bends it by centimetres, ten times what a track is off. Of samples of one stamp the first
+    counts: a truth may stand in two logs.
     """
 
     def __init__(self, stamps_ns: Sequence[int], t_m: Floats, q_xyzw: Floats) -> None:
-        order = sorted(range(len(stamps_ns)), key=stamps_ns.__getitem__)
+        first: dict[int, int] = {}
+        for i, stamp_ns in enumerate(stamps_ns):
+            first.setdefault(stamp_ns, i)
+        order = [first[stamp_ns] for stamp_ns in sorted(first)]
         self.stamps_ns = [stamps_ns[i] for i in order]
         self.t_m = t_m[order]
         self.q_xyzw = normalized(q_xyzw[order])
@@ -85,8 +89,8 @@ class PoseHistory:
         return dense or any(abs(one - stamp_ns) <= CLOSE_NS for one in near)
 
     def _joined(self, after: int) -> bool:
-        """Tell whether a sample and the one before it are near enough to interpolate, and not of one stamp."""
-        return 0 < self.stamps_ns[after] - self.stamps_ns[after - 1] <= MAX_GAP_NS
+        """Tell whether a sample and the one before it are near enough to interpolate."""
+        return self.stamps_ns[after] - self.stamps_ns[after - 1] <= MAX_GAP_NS
 
     def _between(self, after: int, stamp_ns: int) -> tuple[Floats, Floats]:
         """Return t and q between samples after - 1 and after, by Lagrange's formula."""
