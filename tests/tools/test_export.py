@@ -165,6 +165,8 @@ def test_tum_has_the_track_unless_poses_are_asked_for(tracked, capsys):
     assert len(exported(capsys, log, "--format", "tum", "--what", "poses").splitlines()) == 2
     rejected = list(csv.DictReader(io.StringIO(exported(capsys, log, "--format", "csv", "--rejected"))))
     assert [row["reason"] for row in rejected] == ["", "", "ambiguous"]
+    assert main(["export", log, "--format", "csv", "--rejected", "-o", f"{log}.csv"]) == 0
+    assert "the poses, 2 rows, and 1 rows of triggers without one" in capsys.readouterr().err
     assert [rejected[1][name] for name in ("sd_azimuth_rad", "sd_ned_down_m")] == ["0.07", "0.013"]
     assert rejected[0]["sd_azimuth_rad"] == ""
 

@@ -166,7 +166,8 @@ def rows_of(
         if not results:
             raise BuddylineError(f"{name}: {NO_POSES}")
         rows = [_csv_row(one, truth) for one in sorted(results, key=lambda result: result.stamp_ns)]
-        return f"the poses, {len(recorded.poses)} rows", _CSV_FIELDS + _REASON_FIELDS, rows
+        said = f"the poses, {len(recorded.poses)} rows, and {len(recorded.rejected)} rows of triggers without one"
+        return said, _CSV_FIELDS + _REASON_FIELDS, rows
     said, estimates = chosen(recorded, what, name)
     tracks = [one for one in estimates if isinstance(one, Track)]
     if tracks:
