@@ -13,6 +13,7 @@ from buddyline.tools.cli import main
 from buddyline.tools.client import ClientConfig, client_config
 from buddyline.tools.hub import HubConfig, check_exposure, load_hub_config
 
+from tests.disks import small_disk
 from tests.tools.identities import copy_of, expired, make_keys, tls
 
 
@@ -223,3 +224,11 @@ def test_a_certificate_is_renewed_and_the_old_one_is_kept(spoilt, capsys):
     capsys.readouterr()
     assert main(["keys", "--directory", str(spoilt), "renew", "node-z"]) == 2
     assert "there are hub, node-a" in capsys.readouterr().err
+
+
+def test_a_full_disk_leaves_no_empty_key(tmp_path, capsys):
+    with small_disk(tmp_path / "disk", 16) as disk:
+        (disk / "full").write_bytes(bytes(16 << 10))
+        assert main(["keys", "--directory", str(disk / "keys"), "init", "--hub", "127.0.0.1"]) == 2
+        assert f"{disk / 'keys' / 'ca.key'}: cannot be written: No space left" in capsys.readouterr().err
+        assert list((disk / "keys").iterdir()) == []

@@ -11,6 +11,7 @@ from buddyline.protocol.messages import CameraModel, NodeInfo, NodePose
 from buddyline.tools.cli import main
 from msgspec.structs import replace
 
+from tests.disks import small_disk
 from tests.tools import evaluated
 
 START_NS = 1_764_000_000_000_000_000
@@ -151,6 +152,15 @@ def test_export_c3d_has_the_same_markers_as_trc(solved, tmp_path):
     assert np.isnan(points[:3, 6:, 8:]).all()
     assert not np.isnan(points[:3, :6]).any()
     assert main(["export", solved, "--format", "c3d", "--what", "poses", "-o", str(tmp_path / "x.c3d")]) == 2
+
+
+def test_a_c3d_file_on_a_full_disk_is_no_file(solved, tmp_path, capsys):
+    pytest.importorskip("ezc3d")
+    with small_disk(tmp_path / "disk", 16) as disk:
+        (disk / "full").write_bytes(bytes(16 << 10))
+        assert main(["export", solved, "--format", "c3d", "-o", str(disk / "dive.c3d")]) == 2
+        assert "dive.c3d: cannot be written whole; look whether its disk is full" in capsys.readouterr().err
+        assert [path.name for path in disk.iterdir()] == ["full"]
 
 
 @pytest.mark.parametrize(

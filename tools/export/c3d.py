@@ -41,5 +41,19 @@ def export(dive: Dive, output: Path, _what: str | None = None) -> int:
         # The library appends .c3d to a name without it.
         written = Path(folder) / "all.c3d"
         file.write(str(written))
+        if not _is_whole(written, points.size):
+            raise BuddylineError(f"{output}: cannot be written whole; look whether its disk is full")
         written.rename(part)
     return len(frames)
+
+
+def _is_whole(written: Path, values: int) -> bool:
+    """Return whether a file has so many values, of four bytes: the library says nothing where it could not write.
+
+    What it writes last is the number of the block, of 512 bytes and counted from 1, in which the values begin. (It
+    must not read the file itself: a cut one ends the process.)
+    """
+    with open(written, "rb") as file:
+        head = file.read(18)
+    block = int.from_bytes(head[16:18], "little")
+    return block > 1 and written.stat().st_size >= 512 * (block - 1) + 4 * values

@@ -153,10 +153,17 @@ def _write_pair(
         if path.exists():
             raise BuddylineError(f"{path}: exists; no key is ever overwritten, move it away first")
     pem = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    path = key_path
     try:
         # The file has its mode before it has content, so no other user can open it in between.
         with open(os.open(key_path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
             file.write(pem)
+        path = certificate_path
         certificate_path.write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
+    except FileExistsError as error:
+        raise BuddylineError(f"{path}: exists; no key is ever overwritten, move it away first") from error
     except OSError as error:
-        raise BuddylineError(f"{error.filename}: cannot be written: {error.strerror}") from error
+        # Neither was there before.
+        for written in (certificate_path, key_path):
+            written.unlink(missing_ok=True)
+        raise BuddylineError(f"{path}: cannot be written: {error.strerror}") from error
