@@ -23,8 +23,10 @@ from buddyline.tools.align import clocks_json, clocks_of
 from buddyline.tools.clock_curves import LEAST_OFFSET_S, beacon_curves
 from buddyline.tools.clock_sets import ClockSets
 from buddyline.tools.dives import Dive
+from buddyline.tools.extras import MissingExtraError
 from buddyline.tools.losses import collected
 from buddyline.tools.losses import report as report_losses
+from buddyline.tools.newfile import new_folder
 from buddyline.tools.solve import pair_of
 
 log = logging.getLogger(__name__)
@@ -52,9 +54,6 @@ class Outing:
 
 def run(args: argparse.Namespace) -> int:
     """Solve every dive of the folders; return 1 where one could not be solved, or a log was damaged."""
-    folder = Path(args.output)
-    if folder.exists():
-        raise BuddylineError(f"{folder}: exists already; name a new folder with -o")
     found = outings(logs_in(Path(path) for path in args.folders))
     dives = [one for one in found if len(one.nodes) > 1]
     for one in found:
@@ -65,8 +64,8 @@ def run(args: argparse.Namespace) -> int:
             f"{', '.join(args.folders)}: no dive that two nodes recorded at the same time; if they did, their clocks "
             f"are more than {SAME_DIVE_S:g} s apart"
         )
-    folder.mkdir(parents=True)
-    status = 0
+    # An empty one is what an interrupted call leaves.
+    folder, status = new_folder(args.output), 0
     for number, one in enumerate(dives, 1):
         where = folder if len(dives) == 1 else folder / f"dive-{number}"
         where.mkdir(exist_ok=True)
@@ -128,9 +127,12 @@ def _solve(outing: Outing, folder: Path) -> int:
         status |= run_command(["export", str(solved), "--format", kind, "-o", str(folder / name)])
     try:
         status |= run_command(["report", str(solved), "-o", str(folder / "report.html")])
-    except BuddylineError as error:
+    except MissingExtraError as error:
         # The report draws; without the extra for it everything else is there.
         log.warning("no report: %s", error)
+    except BuddylineError as error:
+        log.error("no report: %s", error)
+        status |= 1
     print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
     return status
 

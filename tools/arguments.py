@@ -127,7 +127,9 @@ def detect(parser: argparse.ArgumentParser) -> None:
 def after(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `after`."""
     parser.add_argument("folders", nargs="+", metavar="FOLDER|LOG.mcap", help="what each node recorded")
-    parser.add_argument("-o", "--output", required=True, metavar="DIR", help="a new folder for poses, track and report")
+    parser.add_argument(
+        "-o", "--output", required=True, metavar="DIR", help="folder for poses, track and report; must be new or empty"
+    )
 
 
 def _method(parser: argparse.ArgumentParser) -> None:

@@ -11,10 +11,13 @@ from buddyline.node.sim.scenario import DivePlan, Scenario
 from buddyline.node.sim.world import World
 from buddyline.protocol.clock import MS_NS, S_NS
 from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import RelativePose
+from buddyline.tools import after
 from buddyline.tools.after import logs_in, outings
 from buddyline.tools.cli import main
 from buddyline.tools.dives import Dive
+from buddyline.tools.extras import MissingExtraError
 
 LOGS = Path(__file__).parents[1] / "data" / "golden"
 
@@ -72,8 +75,8 @@ def test_a_dive_s_folders_become_poses_track_and_report(folders, capsys):
     assert abs(told["offset_s"] - 0.03) < 3 * told["sigma_s"]
     assert len(moved_s) > 30
     capsys.readouterr()
-    assert main(["after", str(folders / "a"), "-o", str(out)]) == 2
-    assert "exists already" in capsys.readouterr().err
+    assert main(["after", str(folders / "a"), str(folders / "b"), "-o", str(out)]) == 2
+    assert "is not empty; name another folder, or empty it" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -121,3 +124,32 @@ def test_what_cannot_be_used_is_named(folders, capsys):
         assert main(["after", *words, "-o", str(folders / "dive")]) == 2
         assert expected in capsys.readouterr().err
     assert not (folders / "dive").exists()
+
+
+def test_a_folder_that_an_interrupted_call_left_empty_is_taken_and_one_that_cannot_be_is_said(
+    folders, monkeypatch, capsys
+):
+    asked = []
+    monkeypatch.setattr(after, "_solve", lambda one, folder: asked.append(folder) or 0)
+    (folders / "left").mkdir()
+    assert main(["after", str(folders / "a"), str(folders / "b"), "-o", str(folders / "left")]) == 0
+    assert asked == [folders / "left"]
+    (folders / "file").write_text("")
+    assert main(["after", str(folders / "a"), str(folders / "b"), "-o", str(folders / "file" / "new")]) == 2
+    assert "cannot be made: Not a directory" in capsys.readouterr().err
+
+
+def test_a_report_that_cannot_be_written_is_a_failure_and_one_without_its_extra_is_not(tmp_path, monkeypatch):
+    (tmp_path / "solved.mcap").write_bytes(b"x")
+    one = after.Outing(0, 1, [tmp_path / "a.mcap"], {"a"})
+    faults = {"full": BuddylineError("No space left on device"), "bare": MissingExtraError("needs matplotlib")}
+
+    for fault, status in (("full", 1), ("bare", 0)):
+
+        def run(words, fault=fault):
+            if words[0] == "report":
+                raise faults[fault]
+            return 0
+
+        monkeypatch.setattr(after, "run_command", run)
+        assert after._solve(one, tmp_path) == status
