@@ -224,3 +224,21 @@ def test_bad_tables_are_refused_by_file_line_and_value(tmp_path, text, name, sai
     with pytest.raises(BuddylineError) as refused:
         read(tmp_path, text, name)
     assert said in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("old.svx", "*data normal from to tape compass clino\r\n1 2 10 90 0\r\n\x1a"),
+        (
+            "old.th",
+            "survey a\ncentreline\ndata normal from to length compass clino\n1 2 10 90 0\n"
+            "endcentreline\nendsurvey\n\x1a",
+        ),
+        ("old.csv", "from,to,tape,compass,clino\r\n1,2,10,90,0\r\n\x1a\r\n"),
+    ],
+)
+def test_a_text_may_end_as_programs_of_dos_ended_it(tmp_path, name, text):
+    path = tmp_path / name
+    path.write_bytes(text.encode())
+    assert [shot.tape_m for shot in read_old(path).shots] == [10.0]

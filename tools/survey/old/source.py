@@ -65,6 +65,9 @@ def text_of(path: Path, encoding: str = "") -> str:
 def lines_of(path: Path, encoding: str = "") -> Iterator[SourceLine]:
     """Yield a file's lines without their ends; raise OldSurveyError."""
     text = text_of(path, encoding).replace("\r\n", "\n").replace("\r", "\n")
+    # DOS programs end a text with this character.
+    if text.rstrip("\n").endswith("\x1a"):
+        text = text.rstrip("\n\x1a") + "\n"
     for number, line in enumerate(text.split("\n"), 1):
         yield SourceLine(path, number, line)
 
