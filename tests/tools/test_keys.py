@@ -1,7 +1,9 @@
 """`buddyline keys`: what it writes can be used as it is, is private, and is never overwritten."""
 
 import argparse
+import re
 import stat
+from datetime import UTC, datetime
 
 import pytest
 from buddyline.node.config import load_node_config
@@ -12,6 +14,7 @@ from buddyline.solver_service.config import load_solver_config
 from buddyline.tools.cli import main
 from buddyline.tools.client import ClientConfig, client_config
 from buddyline.tools.hub import HubConfig, check_exposure, load_hub_config
+from buddyline.tools.installation.authority import Authority
 
 from tests.disks import small_disk
 from tests.tools.identities import copy_of, expired, make_keys, tls
@@ -232,3 +235,22 @@ def test_a_full_disk_leaves_no_empty_key(tmp_path, capsys):
         assert main(["keys", "--directory", str(disk / "keys"), "init", "--hub", "127.0.0.1"]) == 2
         assert f"{disk / 'keys' / 'ca.key'}: cannot be written: No space left" in capsys.readouterr().err
         assert list((disk / "keys").iterdir()) == []
+
+
+def test_no_certificate_outlives_its_authority(tmp_path, capsys):
+    words = ["keys", "--directory", str(tmp_path / "keys")]
+    assert main([*words, "--days", "30", "init", "--hub", "127.0.0.1"]) == 0
+    assert main([*words, "node", "a"]) == 0
+    assert "it is valid until" in capsys.readouterr().err
+    assert main([*words, "list"]) == 0
+    assert re.findall(r"\((\d+) days\)", capsys.readouterr().out) == ["29", "29"]
+    for days in ("0", "36501", "9999999"):
+        assert main([*words, "--days", days, "node", "b"]) == 2
+        assert f"--days {days}: from 1 to 36500" in capsys.readouterr().err
+
+
+def test_an_authority_that_has_ended_issues_nothing(spoilt, monkeypatch, capsys):
+    monkeypatch.setattr(Authority, "ends_within", lambda self, days: datetime(2020, 1, 1, tzinfo=UTC))
+    assert main(["keys", "--directory", str(spoilt), "renew", "node-a"]) == 2
+    assert "ca.crt: ended on 2020-01-01; begin anew" in capsys.readouterr().err
+    assert (spoilt / "node-a.crt").exists()

@@ -67,8 +67,16 @@ class Authority:
             raise BuddylineError(f"{directory / 'ca.key'}: is not the key of ca.crt")
         return cls(directory, certificate, key)
 
+    def ends_within(self, days: int) -> datetime.datetime | None:
+        """Return its end, UTC, if it is sooner than so many days: what it issues is valid until then; else None."""
+        until = self._certificate.not_valid_after_utc
+        return until if datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days) > until else None
+
     def issue(self, name: str, days: int, server_host: str | None = None) -> list[Path]:
-        """Make certificate and key for name, as a client, or as the server at server_host; return their files."""
+        """Make certificate and key for name, as a client, or as the server at server_host; return their files.
+
+        It is valid for so many days, and no longer than the authority.
+        """
         key = ec.generate_private_key(ec.SECP256R1())
         purpose = ExtendedKeyUsageOID.SERVER_AUTH if server_host else ExtendedKeyUsageOID.CLIENT_AUTH
         extensions = (
@@ -76,7 +84,8 @@ class Authority:
             x509.SubjectAlternativeName([_general_name(server_host or name)]),
             x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key()),
         )
-        builder = _builder(_name(name), self._certificate.subject, key.public_key(), days, *extensions, signs=False)
+        until = self.ends_within(days) or days
+        builder = _builder(_name(name), self._certificate.subject, key.public_key(), until, *extensions, signs=False)
         paths = [self.directory / f"{name}.crt", self.directory / f"{name}.key"]
         _write_pair(paths[0], builder.sign(self._key, hashes.SHA256()), paths[1], key)
         return paths
@@ -109,11 +118,11 @@ def _builder(
     subject: x509.Name,
     issuer: x509.Name,
     key: ec.EllipticCurvePublicKey,
-    days: int,
+    until: datetime.datetime | int,
     *extensions: x509.ExtensionType,
     signs: bool,
 ) -> x509.CertificateBuilder:
-    """Return a certificate to sign; signs: whether its owner may sign other certificates."""
+    """Return a certificate to sign; until: its end, or days; signs: whether its owner may sign other certificates."""
     now = datetime.datetime.now(datetime.UTC)
     usage = dict.fromkeys(
         ("content_commitment", "key_encipherment", "data_encipherment", "key_agreement", "encipher_only"), False
@@ -121,7 +130,7 @@ def _builder(
     builder = (
         x509.CertificateBuilder(issuer, subject, key, x509.random_serial_number())
         .not_valid_before(now - BACKDATED)
-        .not_valid_after(now + datetime.timedelta(days=days))
+        .not_valid_after(now + datetime.timedelta(days=until) if isinstance(until, int) else until)
         .add_extension(x509.BasicConstraints(ca=signs, path_length=0 if signs else None), critical=True)
         .add_extension(
             x509.KeyUsage(

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 PORT: Final = 7447
 DAYS: Final = 730
 AUTHORITY_DAYS: Final = 3650
+MOST_DAYS: Final = 36500
 
 
 class Role(NamedTuple):
@@ -48,7 +49,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("--directory", default="keys", metavar="DIR", help="where all files are; default: %(default)s")
     parser.add_argument(
-        "--days", type=int, metavar="N", help=f"how long it is valid; default: {DAYS}, the authority 10 years"
+        "--days",
+        type=int,
+        metavar="N",
+        help=f"how long it is valid, no longer than the authority; default: {DAYS}, the authority 10 years",
     )
     whose = parser.add_subparsers(
         dest="whose", required=True, metavar="|".join(("init", "node", *ROLES, "list", "renew"))
@@ -76,19 +80,22 @@ def run(args: argparse.Namespace) -> int:
     needed("cryptography", "keys", "keys")
     from buddyline.tools.installation.authority import Authority
 
-    if args.days is not None and args.days < 1:
-        raise BuddylineError(f"--days {args.days}: at least 1")
+    if args.days is not None and not 1 <= args.days <= MOST_DAYS:
+        raise BuddylineError(f"--days {args.days}: from 1 to {MOST_DAYS}")
     directory = Path(args.directory)
     days = args.days or DAYS
     if args.whose == "list":
         print("\n".join(_listed(Authority.open(directory))))
         return 0
-    if args.whose == "renew":
-        made = _renewed(Authority.open(directory), args.name, days)
-    elif args.whose == "init":
+    if args.whose == "init":
         made = _init(directory, args.hub, days, args.days or AUTHORITY_DAYS)
     else:
-        made = _client(Authority.open(directory), args, days)
+        authority = Authority.open(directory)
+        if ended := authority.ends_within(0):
+            raise BuddylineError(f"{authority.certificate_path}: ended on {ended:%Y-%m-%d}; begin anew: `keys init`")
+        made = _renewed(authority, args.name, days) if args.whose == "renew" else _client(authority, args, days)
+        if ends := authority.ends_within(days):
+            _say(f"it is valid until {ends:%Y-%m-%d}, when the authority ends; `buddyline keys init` makes another one")
     for path in made:
         print(path)
     return 0
