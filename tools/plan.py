@@ -31,6 +31,9 @@ _TILT_RAD: Final = math.radians(12.0)
 _ASIDE: Final = 0.06
 _ATTITUDES: Final = 16
 
+# Half of it is planned, too.
+LEAST_BASELINE_M: Final = 0.01
+
 
 @dataclass(frozen=True)
 class PlannedRange:
@@ -73,6 +76,8 @@ def run(args: argparse.Namespace) -> int:
         value = getattr(args, name)
         if value is not None and not 0 < value < math.inf:
             raise BuddylineError(f"--{name.replace('_', '-')} {value}: give a number above 0")
+    if args.baseline < LEAST_BASELINE_M:
+        raise BuddylineError(f"--baseline {args.baseline}: give {LEAST_BASELINE_M:g} m at least")
     if not 0 <= args.compass_deg < 90:
         raise BuddylineError(f"--compass-deg {args.compass_deg}: give 0 to 90")
     if args.plot is not None:

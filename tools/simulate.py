@@ -7,7 +7,7 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, fields
-from typing import Any
+from typing import Any, Final
 
 from buddyline.node.sim.scenario import (
     DECOYS,
@@ -20,11 +20,15 @@ from buddyline.node.sim.scenario import (
     more_nodes,
 )
 from buddyline.protocol.clock import MS_NS, S_NS
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.options import finite
 from buddyline.tools.progress import Progress
 
 START_NS = 1_764_000_000 * S_NS
 ASPECT = 616 / 820
+# Options that change nothing in a dive without pictures, and in one of pictures.
+IN_PICTURES: Final = {"--exposure": "exposure", "--tags": "tags", "--decoy": "decoy", "--pwm-hz": "pwm_hz"}
+OF_CANDIDATES: Final = {"--gross": "gross_share", "--misses": "miss_share", "--false": "false_lights"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -108,6 +112,7 @@ def run(args: argparse.Namespace) -> int:
     from buddyline.node.sim.world import World
     from buddyline.tools.newfile import new_dive_log
 
+    _check_effect(args)
     cv2.setNumThreads(1)
     plan = DivePlan(**_given(args, DivePlan))
     scenario = Scenario(
@@ -137,6 +142,20 @@ def run(args: argparse.Namespace) -> int:
         count = writer.count
     print(f"{args.output}: {plan.seconds:g} s of {scenario.environment}, {count} messages", file=sys.stderr)
     return 0
+
+
+def _check_effect(args: argparse.Namespace) -> None:
+    """Raise BuddylineError if an option would change nothing: the dive would not be what was asked for."""
+    scenario, plan = Scenario(), DivePlan()
+    usual = {"exposure": plan.exposure, "tags": scenario.tags, "decoy": [], "pwm_hz": scenario.pwm_hz}
+    for option, field in IN_PICTURES.items():
+        if not args.images and getattr(args, field) != usual[field]:
+            raise BuddylineError(f"{option}: is seen in pictures alone; add --images")
+    for option, field in OF_CANDIDATES.items():
+        if args.images and getattr(args, field) != getattr(scenario, field):
+            raise BuddylineError(f"{option}: is of synthetic candidates, which a dive with --images has not")
+    if args.inertial != scenario.inertial and not args.imu:
+        raise BuddylineError(f"--inertial {args.inertial}: is of inertial samples; add --imu")
 
 
 def _given(args: argparse.Namespace, kind: type[Scenario | DivePlan]) -> dict[str, Any]:

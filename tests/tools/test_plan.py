@@ -90,6 +90,7 @@ def test_the_plot_is_written_once(tmp_path, capsys):
     ("words", "named"),
     [
         (["--baseline", "0"], "--baseline"),
+        (["--baseline", "1e-9"], "--baseline 1e-09: give 0.01 m at least"),
         (["--visibility", "-1"], "--visibility"),
         (["--camera", "no.toml"], "no.toml"),
     ],

@@ -69,6 +69,13 @@ def test_pictures_are_as_wide_as_asked_for(tmp_path):
         (["--rate", "0"], "rate_hz"),
         (["--baseline", "-1"], "baseline"),
         (["--width", "1"], "width_px"),
+        (["--decoy", "walls"], "--decoy: is seen in pictures alone; add --images"),
+        (["--exposure", "auto"], "--exposure: is seen in pictures alone"),
+        (["--tags"], "--tags: is seen in pictures alone"),
+        (["--pwm-hz", "200"], "--pwm-hz: is seen in pictures alone"),
+        (["--images", "--misses", "0.5"], "--misses: is of synthetic candidates"),
+        (["--images", "--false", "0"], "--false: is of synthetic candidates"),
+        (["--inertial", "poor"], "--inertial poor: is of inertial samples; add --imu"),
     ],
 )
 def test_bad_arguments_give_a_one_line_error_and_no_file(words, named, tmp_path, capsys):
