@@ -343,7 +343,7 @@ def export(parser: argparse.ArgumentParser) -> None:
         help="default: the track if the log has one (the best of its modes), else the poses; net: all nodes",
     )
     parser.add_argument("--node", metavar="ID", help="of --what net: this node; tum needs it")
-    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: standard output")
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="default, and -: standard output")
     parser.add_argument("--truth", action="store_true", help="the true poses instead of the solved ones (tum)")
     parser.add_argument("--rejected", action="store_true", help="rows for triggers without a pose as well (csv)")
     add_pair_argument(parser, "the only one")

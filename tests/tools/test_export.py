@@ -167,6 +167,12 @@ def test_tum_has_the_track_unless_poses_are_asked_for(tracked, capsys):
     assert [row["reason"] for row in rejected] == ["", "", "ambiguous"]
     assert main(["export", log, "--format", "csv", "--rejected", "-o", f"{log}.csv"]) == 0
     assert "the poses, 2 rows, and 1 rows of triggers without one" in capsys.readouterr().err
+    assert exported(capsys, log, "--format", "tum", "-o", "-").splitlines() == lines
+    assert main(["export", log, "--format", "tum", "--pair", "b/a", "-o", f"{log}.tum"]) == 0
+    assert (
+        "3 rows; `export --what poses` gives the poses; the log has a/b: it is b in a's frame"
+        in capsys.readouterr().err
+    )
     assert [rejected[1][name] for name in ("sd_azimuth_rad", "sd_ned_down_m")] == ["0.07", "0.013"]
     assert rejected[0]["sd_azimuth_rad"] == ""
 

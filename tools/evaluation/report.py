@@ -72,8 +72,8 @@ def _triggers_text(result: Result) -> str:
     if skew is not None:
         drift = "" if skew.drift_ppm is None else f", drift {skew.drift_ppm:.1f} +- {skew.drift_sd_ppm:.1f} ppm"
         lines.append(
-            f"stamps a - b: median {1e3 * skew.median_s:.2f} ms, 95 % within {1e3 * skew.p95_s:.2f} ms,"
-            f" at most {1e3 * skew.largest_s:.2f} ms{drift}"
+            f"stamps {result.node_a} - {result.node_b}: median {1e3 * skew.median_s:.2f} ms,"
+            f" 95 % within {1e3 * skew.p95_s:.2f} ms, at most {1e3 * skew.largest_s:.2f} ms{drift}"
         )
     return "\n".join(lines)
 

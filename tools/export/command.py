@@ -64,6 +64,8 @@ _TRACK_FIELDS: Final = (
 
 def run(args: argparse.Namespace) -> int:
     """Write the track or the poses; return 0."""
+    if args.output == Path("-"):
+        args.output = None
     form = format_of(args.format)
     if args.truth and args.format != "tum":
         raise BuddylineError("--truth: only with --format tum")
@@ -98,6 +100,12 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _frame_words(args: argparse.Namespace, recorded: Recorded) -> str:
+    """Return which node's frame it is in, where --pair named the nodes the other way round."""
+    a, b = recorded.nodes
+    return f"; the log has {a}/{b}: it is {b} in {a}'s frame" if args.pair == (b, a) else ""
+
+
 def _write_table(args: argparse.Namespace, form: ExportFormat) -> str:
     """Write rows and columns; return what they are of, in words."""
     if args.what == "net":
@@ -105,7 +113,9 @@ def _write_table(args: argparse.Namespace, form: ExportFormat) -> str:
 
         said, names, rows = network_rows(args.logs, args.node)
     else:
-        said, names, rows = rows_of(_of_pair(args), args.what, ", ".join(args.logs), rejected=args.rejected)
+        recorded = _of_pair(args)
+        said, names, rows = rows_of(recorded, args.what, ", ".join(args.logs), rejected=args.rejected)
+        said += _frame_words(args, recorded)
     if form.module:
         import_module(f"buddyline.tools.export.{form.module}").write(args.output, said, names, rows)
     else:
@@ -135,9 +145,10 @@ def _lines(args: argparse.Namespace, recorded: Recorded) -> tuple[str, Iterator[
     if args.truth:
         if not recorded.truths:
             raise BuddylineError(f"{name}: no truth in it")
-        return f"the truth, {len(recorded.truths)} rows", tum_lines(recorded.truths)
+        said = f"the truth, {len(recorded.truths)} rows"
+        return said + _frame_words(args, recorded), tum_lines(recorded.truths)
     said, estimates = chosen(recorded, args.what, name)
-    return said, tum_lines(estimates)
+    return said + _frame_words(args, recorded), tum_lines(estimates)
 
 
 def chosen(recorded: Recorded, what: str | None, name: str) -> tuple[str, list[RelativePose] | list[Track]]:
