@@ -20,6 +20,7 @@ from buddyline.protocol.topics import EXPECT
 from buddyline.tools.authenticity import AUTHENTICITY, check_logs
 from buddyline.tools.dives import Dive
 from buddyline.tools.newfile import new_dive_log
+from buddyline.tools.progress import followed
 
 Stamps: TypeAlias = dict[str, tuple[np.ndarray, np.ndarray]]  # series: stamps (ns), sorted, and their payloads' CRC-32
 
@@ -35,7 +36,7 @@ class Union:
         """Read a log once; return for each series which of its messages, in their order, are new: (n,) bool."""
         stamps: defaultdict[str, array[int]] = defaultdict(lambda: array("q"))
         sums: defaultdict[str, array[int]] = defaultdict(lambda: array("L"))
-        for record in reader.records():
+        for record in followed(reader.records(), f"read {reader.path}", reader.start_ns, reader.end_ns):
             series = _series(record)
             stamps[series].append(_stamp_ns(record))
             sums[series].append(zlib.crc32(record.payload))
@@ -73,7 +74,8 @@ def run(args: argparse.Namespace) -> int:
             **({AUTHENTICITY: "; ".join(told)} if told else {}),
         }
         with new_dive_log(args.output, metadata) as writer:
-            for record in heapq.merge(*streams, key=lambda record: record.log_time_ns):
+            merged = heapq.merge(*streams, key=lambda record: record.log_time_ns)
+            for record in followed(merged, "write", dive.start_ns, dive.end_ns):
                 writer.write(
                     record.key, record.payload, record.log_time_ns, record.publish_time_ns, schema=record.schema_name
                 )

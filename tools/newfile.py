@@ -89,6 +89,8 @@ def new_folder(path: Path | str) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
             raise BuddylineError(f"{folder}: is not empty; name another folder, or empty it")
+    except FileExistsError as error:
+        raise BuddylineError(f"{folder}: exists and is no folder; name another") from error
     except OSError as error:
         raise BuddylineError(f"{folder}: cannot be made: {error.strerror}") from error
     return folder

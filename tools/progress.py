@@ -6,10 +6,18 @@ import os
 import shutil
 import sys
 import time
-from typing import Final, TextIO
+from collections.abc import Collection, Iterable, Iterator
+from typing import TYPE_CHECKING, Final, TextIO, TypeVar
+
+from buddyline.protocol.clock import S_NS
+
+if TYPE_CHECKING:
+    from buddyline.protocol.divelog import Record
 
 SHOW_AFTER_S: Final = 1.0
 WIDTH: Final = 30
+
+T = TypeVar("T")
 
 
 def terminal_size() -> os.terminal_size:
@@ -21,6 +29,23 @@ def terminal_size() -> os.terminal_size:
     # A terminal that nobody has given a size says 0.
     found = shutil.get_terminal_size(of_stderr)
     return found if min(found) > 0 else os.terminal_size((80, 24))
+
+
+def followed(records: Iterable[Record], what: str, start_ns: int | None, end_ns: int | None) -> Iterator[Record]:
+    """Yield a log's records, and show by their log time how much is done; start_ns, end_ns: of the log, if any."""
+    begin_ns = start_ns or 0
+    with Progress(what, ((end_ns or 0) - begin_ns) / S_NS) as progress:
+        for record in records:
+            progress.show((record.log_time_ns - begin_ns) / S_NS)
+            yield record
+
+
+def counted(items: Collection[T], what: str) -> Iterator[T]:
+    """Yield items, and show how many of them are done."""
+    with Progress(what, len(items)) as progress:
+        for done, item in enumerate(items):
+            progress.show(done)
+            yield item
 
 
 class Progress:

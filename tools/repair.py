@@ -19,6 +19,7 @@ from buddyline.protocol.divelog import DiveLogReader
 from buddyline.protocol.parity import restore
 from buddyline.tools import losses
 from buddyline.tools.newfile import new_dive_log
+from buddyline.tools.progress import followed
 
 SHOWN_GAPS: Final = 20
 
@@ -30,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
         numbers, times_ns = array("q"), array("q")
         metadata = {**reader.metadata(), "repaired_from": Path(args.input).name}
         with new_dive_log(args.output, metadata) as writer:
-            for record in reader.records():
+            for record in followed(reader.records(), "repair", reader.start_ns, reader.end_ns):
                 writer.write(
                     record.key, record.payload, record.log_time_ns, record.publish_time_ns, schema=record.schema_name
                 )

@@ -147,7 +147,12 @@ def run(args: argparse.Namespace) -> int:
 def _check_effect(args: argparse.Namespace) -> None:
     """Raise BuddylineError if an option would change nothing: the dive would not be what was asked for."""
     scenario, plan = Scenario(), DivePlan()
-    usual = {"exposure": plan.exposure, "tags": scenario.tags, "decoy": [], "pwm_hz": scenario.pwm_hz}
+    usual: dict[str, object] = {
+        "exposure": plan.exposure,
+        "tags": scenario.tags,
+        "decoy": [],
+        "pwm_hz": scenario.pwm_hz,
+    }
     for option, field in IN_PICTURES.items():
         if not args.images and getattr(args, field) != usual[field]:
             raise BuddylineError(f"{option}: is seen in pictures alone; add --images")

@@ -67,8 +67,10 @@ def test_places_that_cannot_be_written_are_named(tmp_path):
     with pytest.raises(BuddylineError, match=r"none/a\.mcap: cannot be written: there is no folder .*none"):
         new_dive_log(tmp_path / "none" / "a.mcap").__enter__()
     (tmp_path / "file").touch()
-    with pytest.raises(BuddylineError, match="cannot be made"):
+    with pytest.raises(BuddylineError, match="file: exists and is no folder"):
         new_folder(tmp_path / "file")
+    with pytest.raises(BuddylineError, match="cannot be made: Not a directory"):
+        new_folder(tmp_path / "file" / "below")
 
 
 def test_a_full_disk_leaves_no_log_of_half_a_dive(tmp_path):

@@ -9,6 +9,7 @@ import numpy as np
 from buddyline.protocol.messages import RelativePose, Track
 from buddyline.tools.evaluation.rotation import Floats, rotate
 from buddyline.tools.evaluation.truth import PoseHistory
+from buddyline.tools.progress import counted
 from msgspec import UNSET
 
 
@@ -50,7 +51,7 @@ def ned_honesty(
     if ned_camera_a is None:
         return None
     errors, sigmas = [], []
-    for said, true_t_m in found:
+    for said, true_t_m in counted(found, "evaluate against true NED"):
         stamp_ns = said.stamp_ns + (said.skew_ns // 2 if isinstance(said, RelativePose) else 0)
         known = ned_camera_a.at(stamp_ns)
         angles = (said.azimuth_rad, said.inclination_rad, said.sigma_azimuth_rad, said.sigma_inclination_rad)

@@ -18,6 +18,7 @@ from buddyline.tools.evaluation.rotation import conjugate, multiply, normalized,
 from buddyline.tools.evaluation.statistics import Stats
 from buddyline.tools.evaluation.truth import PoseHistory
 from buddyline.tools.measure.tables import number, text_table
+from buddyline.tools.progress import counted
 from msgspec.structs import replace
 
 # A node's pose is wrong where it is off by more than this, and by more than WRONG_SIGMAS.
@@ -81,7 +82,7 @@ def _figures(
     origins: dict[tuple[str, int], str],
 ) -> NodeFigures:
     rows = []
-    for pose in poses:
+    for pose in counted(poses, f"evaluate {node}"):
         true = truth[node].at(pose.stamp_ns)
         zero_m = np.zeros(3)
         if (origin := origins.get((net, pose.stamp_ns))) is not None:
@@ -123,9 +124,11 @@ def load_network(paths: Sequence[str], truth_paths: Sequence[str]) -> tuple[list
     with ExitStack() as stack:
         logs, truth_logs = open_each(paths, stack), open_each(truth_paths, stack)
         solved = first_with_net(logs)
-        poses = list(solved.all_of(NET_POSE, NodePose))
+        poses = list(solved.all_of(NET_POSE, NodePose, doing=f"read {solved.name}"))
         curves = noted_curves(solved.metadata(), solved.name)
-        truths = [one for log in [*truth_logs, *logs] for one in log.all_of(NET_TRUTH, NodePose)]
+        truths: list[NodePose] = []
+        for log in [*truth_logs, *logs]:
+            truths += log.all_of(NET_TRUTH, NodePose, doing=f"read {log.name}")
     if not truths:
         named = ", ".join([*paths, *truth_paths])
         raise BuddylineError(f"{named}: no truth of the net's nodes; name its log with --truth T.mcap")

@@ -14,6 +14,7 @@ from buddyline.tools.evaluation.ned import NedHonesty, ned_honesty
 from buddyline.tools.evaluation.poses import WRONG_SHARE, differences
 from buddyline.tools.evaluation.statistics import Stats, share
 from buddyline.tools.evaluation.truth import PoseHistory, TruthTrack
+from buddyline.tools.progress import counted
 
 COVERED_SHARE: Final = TRACK_SIGMA_SHARE
 """A track covers an instant if the sigma of its position is below this share of the range."""
@@ -75,7 +76,11 @@ def _figures(
     ned_camera_a: PoseHistory | None,
     triggers_ns: Collection[int],
 ) -> TrackFigures:
-    found = [(track, known) for track in tracks if (known := truth.interpolated(track.stamp_ns)) is not None]
+    found = [
+        (track, known)
+        for track in counted(tracks, "evaluate the track")
+        if (known := truth.interpolated(track.stamp_ns)) is not None
+    ]
     off = differences(found)
     close = np.array([truth.is_close(track.stamp_ns) for track, _ in found], dtype=bool)
     judged = close if close.any() else np.ones(len(found), dtype=bool)

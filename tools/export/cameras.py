@@ -36,13 +36,13 @@ class CameraView:
 def write_views(dive: Dive, folder: Path) -> tuple[list[CameraView], dict[str, NodeInfo]]:
     """Write a dive's pictures into folder/images; return those that have a pose, and their nodes' calibrations."""
     poses: dict[str, list[NodePose]] = {}
-    for envelope in first_with_net([dive]).messages(NET_POSE.name):
+    for envelope in first_with_net([dive]).messages(NET_POSE.name, doing="read"):
         if isinstance(envelope.message, NodePose):
             poses.setdefault(envelope.message.node, []).append(envelope.message)
     placed = {node: PoseHistory.of_node(in_order(found)) for node, found in poses.items()}
     infos, views = dive.infos(), []
     (folder / PICTURES).mkdir()
-    for envelope in dive.messages(IMAGE.name):
+    for envelope in dive.messages(IMAGE.name, doing="export"):
         picture = envelope.message
         if not isinstance(picture, CompressedImage):
             continue

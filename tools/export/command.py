@@ -22,6 +22,7 @@ from buddyline.tools.evaluation.truth import TruthTrack
 from buddyline.tools.export.formats import ExportFormat, format_of
 from buddyline.tools.measure.tables import csv_lines, tum_line
 from buddyline.tools.newfile import check_new, write_new
+from buddyline.tools.progress import counted
 from msgspec import UNSET
 
 _AXES: Final = ("x", "y", "z", "wx", "wy", "wz")
@@ -182,7 +183,7 @@ def rows_of(
     said, estimates = chosen(recorded, what, name)
     tracks = [one for one in estimates if isinstance(one, Track)]
     if tracks:
-        return said, _TRACK_FIELDS, [_track_csv_row(one, truth) for one in tracks]
+        return said, _TRACK_FIELDS, [_track_csv_row(one, truth) for one in counted(tracks, "export")]
     poses = sorted((one for one in estimates if isinstance(one, RelativePose)), key=lambda pose: pose.stamp_ns)
     return said, _CSV_FIELDS, [_csv_row(pose, truth) for pose in poses]
 

@@ -435,7 +435,7 @@ def _translated(dive: Dive, translation: FoxgloveTranslation, track: str | None)
     left_out = () if track else ("track", "track_lag")
     topics = ["candidates", "image", *(topic for topic in SERIES if topic not in left_out)]
     yield from translation.start(dive.infos(), base_of(dive), dive.start_ns)
-    for envelope in dive.messages(*topics):
+    for envelope in dive.messages(*topics, doing="export"):
         name = envelope.topic.name
         if name in SERIES:
             yield envelope.key, envelope.stamp_ns, envelope

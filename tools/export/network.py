@@ -17,6 +17,7 @@ from buddyline.tools.columns import in_order
 from buddyline.tools.dives import first_with_net, open_each
 from buddyline.tools.evaluation.rotation import Floats, normalized, rotate
 from buddyline.tools.measure.tables import tum_line
+from buddyline.tools.progress import counted
 
 _AXES: Final = ("north", "east", "down", "w_north", "w_east", "w_down")
 _UPPER: Final = [(row, column) for row in range(6) for column in range(row, 6)]
@@ -64,7 +65,7 @@ def _load(paths: Sequence[str]) -> tuple[list[NodePose], dict[str, NodeInfo]]:
     with ExitStack() as stack:
         logs = open_each(paths, stack)
         of_node: dict[str, list[NodePose]] = {}
-        for envelope in first_with_net(logs).messages(NET_POSE.name):
+        for envelope in first_with_net(logs).messages(NET_POSE.name, doing="read"):
             if isinstance(envelope.message, NodePose):
                 of_node.setdefault(envelope.message.node, []).append(envelope.message)
         infos: dict[str, NodeInfo] = {}
@@ -110,7 +111,7 @@ def _markers_of(poses: Sequence[NodePose], infos: dict[str, NodeInfo]) -> Marker
     stamps_ns = sorted({pose.stamp_ns for pose in poses})
     row = {stamp_ns: k for k, stamp_ns in enumerate(stamps_ns)}
     places_m = np.full((len(stamps_ns), len(names), 3), np.nan)
-    for pose in poses:
+    for pose in counted(poses, "export"):
         for marker, place_m in marked[pose.node]:
             ned_m = np.array(pose.p_m) + rotate(normalized(np.array(pose.q_xyzw)), place_m)
             places_m[row[pose.stamp_ns], names.index(marker)] = _NORTH_UP_EAST @ ned_m

@@ -48,7 +48,8 @@ def export(dive: Dive, output: Path, what: str | None = None) -> int:
         recording.save(part)
         drawing = _Drawing(rerun, recording, dive, track)
         left_out = () if track else ("track", "track_lag")
-        for envelope in dive.messages("candidates", "image", *(name for name in SERIES if name not in left_out)):
+        topics = ("candidates", "image", *(name for name in SERIES if name not in left_out))
+        for envelope in dive.messages(*topics, doing="export"):
             entity = envelope.key.removeprefix("buddyline/")
             recording.set_time("stamp", timestamp=np.datetime64(envelope.stamp_ns, "ns"))
             if envelope.topic.name in SERIES:

@@ -41,7 +41,7 @@ def export(dive: Dive, output: Path, what: str | None = None) -> int:
         # The calibrations first: without them no camera has its place in the map.
         for info in dive.infos().values():
             list(translation.messages(info))
-        for envelope in dive.messages(*topics):
+        for envelope in dive.messages(*topics, doing="export"):
             try:
                 said = list(translation.messages(envelope.message))
             except MessageError:

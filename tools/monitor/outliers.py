@@ -93,7 +93,7 @@ def add_pictures(dive: Dive, found: Sequence[Outlier]) -> None:
     frames: dict[tuple[str, int], Candidates] = {}
     images: dict[tuple[str, int], CompressedImage] = {}
     stamps_ns = np.array(sorted(one.pose.stamp_ns for one in found))
-    for envelope in dive.messages("candidates", "image"):
+    for envelope in dive.messages("candidates", "image", doing="outliers"):
         message = envelope.message
         if isinstance(message, Candidates) and message.trigger in by_trigger:
             frames[message.node, message.trigger] = message

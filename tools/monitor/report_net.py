@@ -39,7 +39,7 @@ class DiveNet:
 
 def net_of(dive: Dive) -> DiveNet | None:
     """Read the net of a dive; None where it has none. Smoothed poses are preferred to live ones."""
-    every = list(dive.all_of(NET_POSE, NodePose))
+    every = list(dive.all_of(NET_POSE, NodePose, doing="read the net"))
     if not every:
         return None
     poses: dict[str, list[NodePose]] = defaultdict(list)
@@ -48,10 +48,10 @@ def net_of(dive: Dive) -> DiveNet | None:
         if not smooth or one.mode == "smooth":
             poses[one.node].append(one)
     outcomes, solved = Counter[str](), Counter[str]()
-    for envelope in dive.messages(POSE.name, REJECTED.name):
+    for envelope in dive.messages(POSE.name, REJECTED.name, doing="read outcomes"):
         outcomes["/".join(envelope.ids)] += 1
         solved["/".join(envelope.ids)] += isinstance(envelope.message, RelativePose)
-    return DiveNet(dict(poses), list(dive.all_of(NET_TRUTH, NodePose)), outcomes, solved)
+    return DiveNet(dict(poses), list(dive.all_of(NET_TRUTH, NodePose, doing="read the truth")), outcomes, solved)
 
 
 def net_numbers(net: DiveNet | None) -> dict[str, Any] | None:

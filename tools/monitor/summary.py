@@ -103,7 +103,7 @@ def summarize(dive: Dive, pair: Pair | None) -> Summary:
     lit_before_ns: int | None = None
     counted: set[int] = set()
     curves = noted_curves(dive.metadata(), dive.name)
-    for envelope in dive.messages(*TOPICS):
+    for envelope in dive.messages(*TOPICS, doing="read"):
         message, at_ns = envelope.message, envelope.time_ns
         # A message is in each recording that was running, and in the node's own log.
         identity = hash((envelope.key, envelope.payload))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any, Final
 
 import numpy as np
@@ -192,6 +193,5 @@ def of_logs(paths: list[str]) -> list[PairReadings]:
     """
     with ExitStack() as stack:
         dives = sorted(open_each(paths, stack), key=lambda dive: not dive.nodes("pose"))
-        return of_messages(
-            (envelope.message for dive in dives for envelope in dive.messages(*TOPICS)), ", ".join(map(str, paths))
-        )
+        messages = chain.from_iterable(dive.messages(*TOPICS, doing=f"read {dive.name}") for dive in dives)
+        return of_messages((envelope.message for envelope in messages), ", ".join(map(str, paths)))
