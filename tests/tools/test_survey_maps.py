@@ -58,6 +58,25 @@ def test_kml_has_every_station_and_leg_where_it_is(tmp_path):
     assert all(len(line.text.split()) == 2 for line in lines)
 
 
+@pytest.mark.parametrize("grid", [{"utm_zone": "32N"}, {"epsg": 2154}, {}])
+def test_without_a_fixed_point_a_survey_is_at_the_project_s_place(grid):
+    """There count the declination and the grid's north, not where the grid has its zero."""
+    legs = world.readings_of(world.line(np.random.default_rng(1), 3), np.random.default_rng(1))
+    where = {"latitude_deg": 46.0, "longitude_deg": 11.5}
+    fix = FixedPoint(station="0", **where)
+    free, fixed = (
+        Sheet(project, adjust(project))
+        for project in (
+            world.project_of(legs, place=Place(**where, **grid)),
+            world.project_of(legs, place=Place(**where, **grid), fix=[fix]),
+        )
+    )
+    for name, position in fixed.adjusted.positions.items():
+        assert free.adjusted.positions[name].position_m == pytest.approx(position.position_m, abs=1e-6)
+    assert free.why == fixed.why
+    assert stations_csv(free) == stations_csv(fixed)
+
+
 def test_a_survey_may_cross_the_meridian_where_180_and_minus_180_degrees_meet():
     course = world.loop(np.random.default_rng(1), 14)
     legs = world.readings_of(course, np.random.default_rng(1))

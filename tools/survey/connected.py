@@ -59,8 +59,9 @@ def water_level_m(project: Project) -> float:
 
 
 def fixed_points(project: Project, grid: Grid) -> Fixed:
-    """Return the fixed stations' positions and sigmas; without any, the first leg's start at east 0, north 0.
+    """Return the fixed stations' positions and sigmas; without any, the first leg's start.
 
+    That is at the project's place in a map grid, whose north differs from place to place; else at east 0, north 0.
     An altitude is NaN where depths give it.
     """
     depths, level_m = station_depths(project), water_level_m(project)
@@ -79,7 +80,7 @@ def fixed_points(project: Project, grid: Grid) -> Fixed:
             raise BuddylineError(f"the project has no legs; {next_step}")
         start = _start_of(project)
         altitude_m = math.nan if start in by_depth else level_m - depths.get(start, 0.0)
-        fixed[start] = np.array([0.0, 0.0, altitude_m]), np.zeros(3)
+        fixed[start] = np.array([*grid.anchor_m, altitude_m]), np.zeros(3)
     return fixed
 
 
