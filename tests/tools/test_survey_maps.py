@@ -4,17 +4,19 @@ import csv
 import io
 import sqlite3
 import struct
+from datetime import date
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from buddyline.protocol.config import ConfigError
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.survey import maps
 from buddyline.tools.survey.geodesy import radii_m
 from buddyline.tools.survey.network import adjust
 from buddyline.tools.survey.old.joining import joined, named
 from buddyline.tools.survey.old.readers import read_old
-from buddyline.tools.survey.project import Equate, FixedPoint, Place
+from buddyline.tools.survey.project import DiveFiles, Equate, FixedPoint, Place
 from buddyline.tools.survey.sheet import Sheet
 from buddyline.tools.survey.tables import map_features, stations_csv
 
@@ -75,6 +77,25 @@ def test_without_a_fixed_point_a_survey_is_at_the_project_s_place(grid):
         assert free.adjusted.positions[name].position_m == pytest.approx(position.position_m, abs=1e-6)
     assert free.why == fixed.why
     assert stations_csv(free) == stations_csv(fixed)
+
+
+def test_a_fixed_point_far_from_the_place_is_refused():
+    legs = world.readings_of(world.line(np.random.default_rng(1), 3), np.random.default_rng(1))
+    place = Place(latitude_deg=46.0, longitude_deg=11.5, utm_zone="32N")
+    exchanged = FixedPoint(station="0", east_m=5098000.0, north_m=693000.0)
+    with pytest.raises(ConfigError, match=r"fix of '0': east_m = .* km from \[place\]"):
+        adjust(world.project_of(legs, place=place, fix=[exchanged]))
+    right = FixedPoint(station="0", east_m=693000.0, north_m=5098000.0)
+    assert adjust(world.project_of(legs, place=place, fix=[right])).positions
+
+
+def test_a_declination_beyond_the_models_is_said_to_be_extrapolated():
+    legs = world.readings_of(world.line(np.random.default_rng(1), 3), np.random.default_rng(1))
+    for year, said in ((1987, True), (2009, True), (2010, False), (2029, False), (2030, True)):
+        project = world.project_of(
+            legs, place=Place(**WHERE), dive=[DiveFiles(logs=["a.mcap"], date=date(year, 12, 31))]
+        )
+        assert ("extrapolated: the models are of 2010 to 2029" in Sheet(project, adjust(project)).why) == said
 
 
 def test_a_survey_may_cross_the_meridian_where_180_and_minus_180_degrees_meet():

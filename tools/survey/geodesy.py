@@ -25,6 +25,8 @@ FLATTENING: Final = 1 / 298.257223563
 _E2: Final = FLATTENING * (2 - FLATTENING)
 # Places are rounded to this for the World Magnetic Model: to a kilometre, in which it changes by 0.01 degrees.
 MODEL_DIGITS: Final = 2
+# No survey reaches so far from its place.
+FAR_M: Final = 200e3
 # Half the way by which a grid's north and scale are found.
 STEP_M: Final = 10.0
 
@@ -175,7 +177,12 @@ def declination(project: Project) -> Declination | None:
     if not dates:
         return None
     when = f"{dates[0]}" if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
-    return Declination(f"World Magnetic Model, {where[0]:.4f} {where[1]:.4f}, {when}", None)
+    from buddyline.node.geomagnetism import FIRST_MODEL, NEWEST_MODEL
+
+    last = NEWEST_MODEL + 4
+    outside = dates[0].year < FIRST_MODEL or dates[-1].year > last
+    beyond = f", extrapolated: the models are of {FIRST_MODEL} to {last}" if outside else ""
+    return Declination(f"World Magnetic Model, {where[0]:.4f} {where[1]:.4f}, {when}{beyond}", None)
 
 
 def _projection(project: Project) -> Projection | None:
@@ -198,6 +205,26 @@ def _somewhere(project: Project) -> tuple[float, float] | None:
         if projection is not None and fix.metres is not None:
             return projection.degrees(*fix.metres)
     return None
+
+
+def _check_near(project: Project, projection: Projection) -> None:
+    """Raise ConfigError for a fixed point in metres far from the stated place: exchanged, or of another grid."""
+    place = project.place.degrees
+    for fix in project.fix if place is not None else ():
+        if place is None or fix.metres is None:
+            continue
+        latitude_deg, longitude_deg = projection.degrees(*fix.metres)
+        per_longitude_m, per_latitude_m = radii_m(place[0])
+        away_m = math.hypot(
+            math.radians(latitude_deg - place[0]) * per_latitude_m,
+            math.radians(math.remainder(longitude_deg - place[1], 360)) * per_longitude_m,
+        )
+        if away_m > FAR_M:
+            east_m, north_m = fix.metres
+            raise ConfigError(
+                f"fix of {fix.station!r}: east_m = {east_m:g}, north_m = {north_m:g} is at {latitude_deg:.3f}, "
+                f"{longitude_deg:.3f} in EPSG:{projection.epsg}, {away_m / 1e3:.0f} km from [place]"
+            )
 
 
 @dataclass(frozen=True)
@@ -286,6 +313,7 @@ def grid_of(project: Project) -> Grid:
     if projection is not None:
         if known is None or where is None:
             raise BuddylineError("place: a map grid needs a position and a declination as well, to turn to grid north")
+        _check_near(project, projection)
         grid = Grid("grid", known, where, projection)
         anchor_m = grid.position_m(project.fix[0]) if project.fix else projection.metres(*where)
         return replace(grid, anchor_m=anchor_m)

@@ -56,7 +56,7 @@ class Place(Config, frozen=True, kw_only=True):
     latitude_deg: Latitude | UnsetType = UNSET
     longitude_deg: Longitude | UnsetType = UNSET
     water_level_m: float | UnsetType = UNSET
-    declination_deg: float | UnsetType = UNSET
+    declination_deg: Annotated[float, Meta(ge=-180, le=180)] | UnsetType = UNSET
     declination_source: str = ""
     utm_zone: Annotated[str, Meta(pattern=r"^\d{1,2}[NS]$")] | UnsetType = UNSET
     epsg: int | UnsetType = UNSET
