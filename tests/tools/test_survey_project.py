@@ -6,6 +6,7 @@ import json
 import os
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -87,6 +88,28 @@ def test_exports_and_reports_refuse_to_overwrite(tmp_path, logs, words):
         with pytest.raises(BuddylineError, match=f"{precious.name}: exists"):
             run(words[0], path, *words[1:], "-o", precious)
         assert precious.read_bytes() == before
+
+
+def test_a_project_in_a_linked_folder_finds_its_logs(tmp_path, logs, monkeypatch):
+    (tmp_path / "disk" / "below").mkdir(parents=True)
+    (tmp_path / "surveys").symlink_to(tmp_path / "disk" / "below")
+    monkeypatch.chdir(tmp_path)
+    path = Path("surveys") / "cave.toml"
+    assert run("legs", path, "--dive", "a.mcap", "solved.mcap") == 0
+    assert run("legs", path) == 0
+    assert load_project(path).dive[0].logs == ["../../a.mcap", "../../solved.mcap"]
+    (tmp_path / "old.csv").write_text("from,to,length,azimuth,clino,date\n1,2,5,90,0,2020-01-01\n")
+    assert run("import", path, "old.csv") == 0
+    assert run("adjust", path) in (0, 1)
+
+
+def test_logs_that_cannot_be_read_begin_no_project(tmp_path, logs):
+    path = tmp_path / "cave.toml"
+    for wrong in ("none.mcap", logs[0]):
+        with pytest.raises(BuddylineError, match=r"cannot be read|holds no poses"):
+            run("legs", path, "--dive", wrong)
+        assert not path.exists()
+    assert run("legs", path, "--dive", *logs) == 0
 
 
 def test_line_ends_links_and_permissions_of_a_project_stay(tmp_path, logs):
@@ -283,6 +306,7 @@ def test_known_errors_are_reported(tmp_path, logs):
     with pytest.raises(ConfigError, match="no such leg"):
         run("adjust", path)
     latin = os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.mcap")
+    Path(latin).write_bytes(Path(logs[1]).read_bytes())
     with pytest.raises(BuddylineError, match=r"not UTF-8 text, .* rename the file"):
         run("legs", tmp_path / "latin.toml", "--dive", latin)
     assert not (tmp_path / "latin.toml").exists()

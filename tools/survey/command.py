@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from collections.abc import Callable
 from dataclasses import asdict
@@ -19,6 +18,7 @@ from buddyline.tools.client import add_client_arguments
 
 if TYPE_CHECKING:
     from buddyline.tools.survey.network import Adjusted
+    from buddyline.tools.survey.readings import PairReadings
     from buddyline.tools.survey.sheet import Sheet
 
 # Format to the ending of its file, beside the project.
@@ -157,19 +157,32 @@ def _legs(args: argparse.Namespace) -> int:
     from buddyline.tools.survey.derive import Derived
     from buddyline.tools.survey.gauges import adjust_gauges
     from buddyline.tools.survey.marks import of_project, of_table
-    from buddyline.tools.survey.project import Made, load_project, new_project, own_equates, sources_of, write_derived
+    from buddyline.tools.survey.project import (
+        Made,
+        beside,
+        check_project,
+        load_project,
+        new_project,
+        own_equates,
+        sources_of,
+        write_derived,
+    )
     from buddyline.tools.survey.readings import of_logs
 
     path: Path = args.project
+    read: dict[int, list[PairReadings]] = {}
     if args.dive:
-        new_project(path, path.stem, [os.path.relpath(log, path.parent) for log in args.dive])
+        # What cannot be read begins no project, so that the next call may have the same name.
+        check_project(path)
+        read[1] = of_logs(args.dive)
+        new_project(path, path.stem, [beside(path, log) for log in args.dive])
     project = load_project(path)
     if not project.dive:
         raise BuddylineError(f"{path}: names no dive; add [[dive]] with its logs")
     marks = project.mark + (of_table(args.marks, len(project.dive)) if args.marks else [])
     derived = Derived()
     for number, one in enumerate(project.dive, 1):
-        pairs = of_logs([str(path.parent / log) for log in one.logs])
+        pairs = read.get(number) or of_logs([str(path.parent / log) for log in one.logs])
         by_hand = of_project(marks, number, int(pairs[0].stamps_ns[0]))
         derived.add(pairs, project.settings, project.alarms, number, by_hand)
     for same in own_equates(project):
@@ -204,13 +217,13 @@ def _legs(args: argparse.Namespace) -> int:
 def _import(args: argparse.Namespace) -> int:
     """Add old surveys to a project, new if there is none; return 1 where something in them was not read."""
     from buddyline.tools.survey.old.joining import joined, name_of, read_project_files
-    from buddyline.tools.survey.project import About, OldFile, Project, add_old, load_project, new_project
+    from buddyline.tools.survey.project import About, OldFile, Project, add_old, beside, load_project, new_project
     from msgspec import structs
 
     path: Path = args.project
     if args.name and len(args.files) > 1:
         raise BuddylineError("--name is for one file")
-    added = [OldFile(file=os.path.relpath(one, path.parent), name=args.name or name_of(one)) for one in args.files]
+    added = [OldFile(file=beside(path, one), name=args.name or name_of(one)) for one in args.files]
     project = load_project(path) if path.exists() else Project(survey=About(name=path.stem))
     whole = structs.replace(project, old=project.old + added)
     olds = read_project_files(whole, path.parent)

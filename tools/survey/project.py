@@ -22,12 +22,13 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import Config, ConfigError, load_config
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NodeId, NonNegative, Positive
-from buddyline.tools.newfile import write_new
+from buddyline.tools.newfile import check_new, write_new
 from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
 from msgspec import UNSET, Meta, UnsetType, field
 
 MARKER: Final = "# ---- From the dives, by `buddyline survey legs`: made anew each time. Edit above. ----"
 STATION_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,12}\Z")
+ANOTHER_DIVE: Final = "add the dive to it as another [[dive]]"
 # The years whose instants are counts of nanoseconds in 64 bits.
 YEARS: Final = range(1970, 2262)
 # No dive is so long.
@@ -441,13 +442,23 @@ def _write_again(path: Path, text: str, old: str) -> None:
         fresh.unlink(missing_ok=True)
 
 
+def beside(path: Path, file: Path | str) -> str:
+    """Return a file's name relative to the folder of a project, to which a link may lead."""
+    return os.path.relpath(os.path.abspath(file), path.parent.resolve())
+
+
+def check_project(path: Path) -> None:
+    """Raise BuddylineError if a project cannot be begun, because it exists."""
+    check_new(path, ANOTHER_DIVE)
+
+
 def new_project(path: Path, name: str, logs: list[str], old: Sequence[OldFile] = ()) -> None:
     """Write a project file to fill in; raise BuddylineError if one exists."""
     for each in (name, *logs, *(one.file for one in old)):
         _check_unicode(each)
     text = TEMPLATE.format(name=_toml_value(name))
     text += f"\n[[dive]]\nlogs = {_toml_value(logs)}\n" * bool(logs) + (_toml({"old": list(old)}) if old else "")
-    write_new(path, text, hint="add the dive to it as another [[dive]]")
+    write_new(path, text, ANOTHER_DIVE)
 
 
 def _check_unicode(name: str) -> None:
