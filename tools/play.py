@@ -236,16 +236,26 @@ def _span(dive: Dive, start_s: float, end_s: float | None) -> tuple[int, int]:
     start_ns = first_ns + round(start_s * S_NS)
     stop_ns = last_ns + 1 if end_s is None else first_ns + round(end_s * S_NS)
     if not first_ns <= start_ns <= last_ns or stop_ns <= start_ns:
-        raise BuddylineError(
-            f"--start {start_s} --end {end_s}: the dive goes from 0 to {(last_ns - first_ns) / S_NS:.1f} s"
-        )
+        given = f"--start {start_s:g}" + ("" if end_s is None else f" --end {end_s:g}")
+        raise BuddylineError(f"{given}: the dive goes from 0 to {(last_ns - first_ns) / S_NS:.1f} s")
     return start_ns, stop_ns
 
 
 def _selected(dive: Dive, start_ns: int, stop_ns: int) -> Iterator[Envelope]:
-    """Yield the messages to send, between start_ns and stop_ns, and calibrations from before start_ns."""
+    """Yield the messages to send, between start_ns and stop_ns, and calibrations from before start_ns.
+
+    What stands in two logs, as in a dive and the solved dive, is sent once.
+    """
+    sent: set[tuple[str, bytes]] = set()
+    at_ns = -1
     for envelope in dive.messages(*SENT):
         if envelope.time_ns >= stop_ns:
             return
+        if envelope.time_ns != at_ns:
+            sent.clear()
+            at_ns = envelope.time_ns
+        if (envelope.key, envelope.payload) in sent:
+            continue
+        sent.add((envelope.key, envelope.payload))
         if envelope.time_ns >= start_ns or envelope.topic is INFO:
             yield envelope

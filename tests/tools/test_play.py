@@ -66,6 +66,14 @@ def test_everything_but_what_a_solver_made_is_sent(log):
     assert len(played.messages(Imu)) == 2 * 200
 
 
+def test_what_stands_in_two_logs_is_sent_once(log, tmp_path):
+    twin = tmp_path / "twin.mcap"
+    twin.write_bytes(log.read_bytes())
+    with Dive([log]) as alone, Dive([log, twin]) as both:
+        once, twice = (list(_selected(dive, *_span(dive, 0.0, None))) for dive in (alone, both))
+    assert sorted((one.key, one.payload) for one in twice) == sorted((one.key, one.payload) for one in once)
+
+
 def test_the_playback_rate_follows_speed(log):
     assert Played(log).clock.now_ns() - 5 == pytest.approx(1.98e9, abs=1e8)
     assert Played(log, speed=4.0).clock.now_ns() - 5 == pytest.approx(1.98e9 / 4, abs=3e7)
@@ -160,8 +168,9 @@ def test_fast_playback_without_a_solver_does_not_wait(log, monkeypatch):
 
 @pytest.mark.parametrize(("start_s", "end_s"), [(-1.0, None), (99.0, None), (1.0, 0.5)])
 def test_a_part_outside_the_dive_is_refused(log, start_s, end_s):
-    with Dive([log]) as dive, pytest.raises(BuddylineError, match="the dive goes from 0 to"):
+    with Dive([log]) as dive, pytest.raises(BuddylineError, match="the dive goes from 0 to") as refused:
         _span(dive, start_s, end_s)
+    assert "None" not in str(refused.value)
 
 
 def test_playback_stays_until_the_solver_has_answered_the_last_frames(log, monkeypatch):
