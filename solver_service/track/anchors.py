@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_log
-from buddyline.solver_service.track.state import DEPTH_OFFSET, PHI, R_, SIZE, V_, State
+from buddyline.solver_service.track.state import DEPTH_OFFSET, DEPTH_SCALE, PHI, R_, SIZE, V_, State
 
 # For how long an attitude filter errs alike: tilt, heading. A message counts dt / (2 T) of an independent one.
 TILT_TIME_S: Final = 10.0
@@ -41,19 +41,20 @@ def attitude_covariance(R_ned_body: Floats, sigma_rad: Floats, tilt_factor: floa
 def depth_residual(state: State, shown_m: float, age_s: float, ports_m: Floats) -> tuple[Floats, Floats]:
     """Give y (1,) and H (1, SIZE) of B's depth minus A's as shown age_s before the state's time.
 
-    ports_m (2, 3): of the ports, camera frames. h = (r + R_B p_B - R_A p_A)_z - v_z age + offset.
+    ports_m (2, 3): of the ports, camera frames. h = (1 + scale) d + offset, d = (r + R_B p_B - R_A p_A)_z - v_z age.
     """
     (xa, ya, za), (xb, yb, zb) = (state.R @ ports_m[:, :, None])[:, :, 0].tolist()
     (x, y, z), (u, v, w) = state.r_m.tolist(), (age_s * state.v_mps).tolist()
-    h = z - w + zb - za + state.depth_offset_m
+    d, scaled = z - w + zb - za, 1.0 + state.depth_scale
     H = np.zeros((1, SIZE))
-    H[0, R_.start + 2] = 1.0
-    H[0, V_.start + 2] = -age_s
+    H[0, R_.start + 2] = scaled
+    H[0, V_.start + 2] = -scaled * age_s
     # Turning moves what stands at p by phi x p, of which this is the downward part; r turns with phi_B, v with phi_A.
-    H[0, PHI[0]] = -v - ya, xa + u, 0.0
-    H[0, PHI[1]] = y + yb, -x - xb, 0.0
+    H[0, PHI[0]] = scaled * (-v - ya), scaled * (xa + u), 0.0
+    H[0, PHI[1]] = scaled * (y + yb), scaled * (-x - xb), 0.0
     H[0, DEPTH_OFFSET] = 1.0
-    return np.array((shown_m - h,)), H
+    H[0, DEPTH_SCALE] = d
+    return np.array((shown_m - scaled * d - state.depth_offset_m,)), H
 
 
 class Update(NamedTuple):

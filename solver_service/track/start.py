@@ -15,6 +15,7 @@ from buddyline.solver_service.track.state import (
     CLOCK,
     DELAY,
     DEPTH_OFFSET,
+    DEPTH_SCALE,
     GYRO_BIAS,
     LEVER,
     MOUNT,
@@ -41,6 +42,8 @@ DELAY_TOLD_S: Final = 0.001
 DELAY_UNTOLD_S: Final = 0.004
 CLOCK_S: Final = 0.1
 DEPTH_OFFSET_M: Final = 0.2
+# Both gauges are told one density of the water; the sea's is 3 % above that of fresh water.
+DEPTH_SCALE_SIGMA: Final = 0.015
 # A later pass starts with BROAD_SIGMAS of what an earlier one has left, at least LEAST_BROAD in each error, and no more
 # than the first two: the lights count anew.
 BROAD_R_M: Final = 0.5
@@ -69,7 +72,7 @@ def constants_of(
         sigma[LEVER[i]] = LEVER_UNTOLD_M if node.imu_m is None else LEVER_TOLD_M
         sigma[DELAY[i]] = DELAY_UNTOLD_S if node.imu_delay_ns is None else DELAY_TOLD_S
     sigma[CLOCK] = clock_sigma_s
-    sigma[DEPTH_OFFSET] = DEPTH_OFFSET_M
+    sigma[DEPTH_OFFSET], sigma[DEPTH_SCALE] = DEPTH_OFFSET_M, DEPTH_SCALE_SIGMA
     return state, sigma**2
 
 

@@ -30,7 +30,8 @@ LEVER: Final = (slice(39, 42), slice(42, 45))
 DELAY: Final = (45, 46)
 CLOCK: Final = 47
 DEPTH_OFFSET: Final = 48
-SIZE: Final = 49
+DEPTH_SCALE: Final = 49
+SIZE: Final = 50
 NAV: Final = 12
 """The first errors: of position, velocity and attitudes."""
 MOVING: Final = 21
@@ -47,7 +48,8 @@ _SHAKE, _GYRO_BIAS, _ACCEL_BIAS, _MOUNT, _LEVER = _PER_NODE
 _DELAY: Final = slice(57, 59)
 CLOCK_COLUMN: Final = 59
 _DEPTH_OFFSET: Final = 60
-ROW: Final = 61
+_DEPTH_SCALE: Final = 61
+ROW: Final = 62
 _BOTH: Final = slice(PHI[0].start, PHI[1].stop)
 _IDENTITY: Final[Floats] = np.eye(3)
 _STILL: Final[Floats] = np.eye(MOVING)
@@ -136,6 +138,11 @@ class State:
         """What B's gauge shows too much against A's; of a batch an array."""
         return self.row[..., _DEPTH_OFFSET][()]  # type: ignore[return-value]
 
+    @property
+    def depth_scale(self) -> float:
+        """By which share both gauges show depths too large; of a batch an array."""
+        return self.row[..., _DEPTH_SCALE][()]  # type: ignore[return-value]
+
     def _of_nodes(self, part: slice) -> Floats:
         return self.row[..., part].reshape(*self.row.shape[:-1], 2, 3)
 
@@ -191,7 +198,7 @@ class State:
     def with_parts(self, **parts: Floats | float) -> State:
         """Return a state whose named quantities are others."""
         changed = State(self.row.copy())
-        at = {"clock_s": CLOCK_COLUMN, "depth_offset_m": _DEPTH_OFFSET}
+        at = {"clock_s": CLOCK_COLUMN, "depth_offset_m": _DEPTH_OFFSET, "depth_scale": _DEPTH_SCALE}
         for name, value in parts.items():
             if name in at:
                 changed.row[..., at[name]] = value

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
-from buddyline.solver_service.track.anchors import attitude_residual, depth_residual
+from buddyline.solver_service.track.anchors import attitude_residual, depth_residual, kalman
 from buddyline.solver_service.track.lights import BLOCK, COLUMNS, light_positions, residuals
 from buddyline.solver_service.track.output import at_one_time, at_one_time_jacobian, pose_jacobian, rows_of
+from buddyline.solver_service.track.start import DEPTH_OFFSET_M, DEPTH_SCALE_SIGMA
 from buddyline.solver_service.track.state import (
     CLOCK,
     DELAY,
     DEPTH_OFFSET,
+    DEPTH_SCALE,
     MOVING,
     NAV,
     PHI,
@@ -53,6 +55,7 @@ def a_state(seed: int) -> State:
         delay_s=rng.normal(0.0, 0.003, 2),
         clock_s=0.002,
         depth_offset_m=0.1,
+        depth_scale=0.03,
     )
 
 
@@ -187,7 +190,7 @@ def test_transition(seed: int, arm: bool) -> None:
     names = np.array([column for column in range(SIZE) if column != CLOCK])
     off = np.abs(F[:, names] - differences(moved, names))
     gap = off.max(axis=0)
-    exact = np.isin(names, (*range(NAV), *range(18, 21), *range(27, 33), *range(39, 45), DEPTH_OFFSET))
+    exact = np.isin(names, (*range(NAV), *range(18, 21), *range(27, 33), *range(39, 45), DEPTH_OFFSET, DEPTH_SCALE))
     assert gap[exact].max() < 1e-6
     # A mount's error is taken as one more small turn, and sums go by the middles of intervals. The lever arm's ends
     # turn with bias, mount and delay, which is left out: 0.1 m at 0.01 rad/s is 1 mm/s.
@@ -261,3 +264,20 @@ def test_pose_covariance() -> None:
     whole = J @ P @ J.T
     assert np.allclose(covariance[:6, :6], whole[:6, :6], atol=3e-3)
     assert np.allclose(covariance[6:9, 6:9], whole[6:, 6:], atol=1e-6)
+
+
+def test_gauges_that_take_the_sea_for_fresh_water_do_not_move_a_track() -> None:
+    """B rises 10 m above A, which lights show to 5 cm; both gauges show depths 2.8 % too large, and B's 0.1 m more."""
+    state, P = State.at_rest(np.zeros(3), a_state(6).R), np.zeros((SIZE, SIZE))
+    P[DEPTH_OFFSET, DEPTH_OFFSET], P[DEPTH_SCALE, DEPTH_SCALE] = DEPTH_OFFSET_M**2, DEPTH_SCALE_SIGMA**2
+    for height_m in np.linspace(0.0, 10.0, 41).tolist():
+        there = np.array((3.0, 0.0, -height_m))
+        P[R_] = P[:, R_] = 0.0
+        P[R_, R_] = 0.05**2 * np.eye(3)
+        state = state.moved(there, state.v_mps, state.R)
+        y, H = depth_residual(state, -1.028 * height_m + 0.1, 0.0, np.zeros((2, 3)))
+        error, P, *_ = kalman(P, H, y, np.array(((0.02**2,),)))
+        state = state.plus(error)
+        assert abs(state.r_m[2] + height_m) < 3.0 * np.sqrt(P[R_.stop - 1, R_.stop - 1])
+    assert abs(state.depth_scale - 0.028) < 3.0 * np.sqrt(P[DEPTH_SCALE, DEPTH_SCALE]) < 0.02
+    assert abs(state.depth_offset_m - 0.1) < 3.0 * np.sqrt(P[DEPTH_OFFSET, DEPTH_OFFSET]) < 0.1
