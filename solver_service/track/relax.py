@@ -41,7 +41,7 @@ from buddyline.solver_service.track.seeing import (
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.smoother import Path
 from buddyline.solver_service.track.start import CLOCK_S, broad_covariance, constants_of
-from buddyline.solver_service.track.state import MOVING, State
+from buddyline.solver_service.track.state import MOVING, State, place_covariance
 from buddyline.solver_service.track.stepping import DEPTH_GATE, TrackSteps
 from buddyline.solver_service.track.strapdown import (
     integrate,
@@ -56,8 +56,11 @@ from buddyline.solver_service.track.trail import Look, Residuals, Step
 from buddyline.solver_service.track.visible import EDGE_PX, found_now, learn_found
 from buddyline.solver_service.track.walking import Walking
 
-# What is believed of the place at first, 1 sd, as a share of the range.
+# What is believed of the place at first, 1 sd: this share of the range, and at least so many of the path's sigmas. It
+# is centred where the path begins, which the same lights and samples have told: what is believed counts them twice.
+# With far more sigmas rounding would spoil the first steps.
 BROAD_SHARE: Final = 0.5
+PATH_SIGMAS: Final = 10.0
 # Where motion is guessed, and pictures are further apart than this, the next one tells little of this one.
 SOON_S: Final = 0.3
 # Noise and units are judged by the samples of two seconds.
@@ -123,7 +126,8 @@ class PathPass(TrackSteps):
         first, start_s = path.state(0), float(path.t_s[0])
         # Constants are believed as at first, whatever a pass before made of the same lights.
         told, _ = constants_of(self.nodes, first.R, first.r_m, known.clock_sigma_s)
-        place_m = BROAD_SHARE * float(np.linalg.norm(first.r_m))
+        path_m = float(np.sqrt(np.trace(place_covariance(first, path.covariance(0)))))
+        place_m = max(BROAD_SHARE * float(first.range_m), PATH_SIGMAS * path_m)
         P = broad_covariance(self.nodes, first, known.clock_sigma_s, shaking=shaking, place_m=place_m)
         self.passed = Estimate(
             start_s,

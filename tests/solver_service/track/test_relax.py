@@ -10,13 +10,14 @@ from buddyline.solver_service.track import relax, seeing
 from buddyline.solver_service.track.association import odds_of
 from buddyline.solver_service.track.dive import smooth
 from buddyline.solver_service.track.estimate import Estimate
+from buddyline.solver_service.track.inputs import FrameSeen
 from buddyline.solver_service.track.lights import COLUMNS, Sight, with_stamp
 from buddyline.solver_service.track.parts import parts_of
 from buddyline.solver_service.track.records import feed, pass_over
 from buddyline.solver_service.track.relax import PassedOver, PathPass
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.smoother import Path, smoothed
-from buddyline.solver_service.track.state import MOVING, NAV, PHI, R_, SIZE
+from buddyline.solver_service.track.state import MOVING, NAV, PHI, R_, SIZE, V_
 from buddyline.solver_service.track.walking import Walking
 
 from tests.solver_service.track.assignments import weigh
@@ -60,6 +61,38 @@ def test_passes_about_a_path_that_is_off_end_at_the_same_path() -> None:
     for _ in range(3):
         path = passed_about(dive, path)
     assert moved(path, right) < 0.01
+
+
+def test_a_pass_believes_nothing_of_where_its_path_has_a_dark_start() -> None:
+    """It is what the pass before made of the same lights and samples: believed, they would count twice.
+
+    Before the first light samples alone tell the place, linearly. So one pass comes back to the same path.
+    """
+    dive = make(5, Setting(seconds=9.0, false=0, near_m=1.2, far_m=1.6))
+    first = filter_of(dive.records, dive.fixes)
+    pass_over(first, dive.records, dive.fixes)
+    path, lit_ns = smoothed(parts_of(first)[0].steps), EPOCH_NS + 6_000_000_000
+    looks = [tuple(replace(look, chosen=look.chosen * (look.stamp_ns >= lit_ns)) for look in of) for of in path.looks]
+    a, b = (replace(one, frames=[dark_until(lit_ns, frame) for frame in one.frames]) for one in dive.records)
+    dive, right = replace(dive, records=(a, b)), replace(path, looks=looks)
+    for _ in range(4):
+        right = passed_about(dive, right)
+    lit = next(k for k, of in enumerate(right.looks) if any(look.chosen for look in of))
+    left_s = np.maximum(right.t_s[lit - 1] - right.t_s, 0.0)[:, None]
+    v_mps, states = np.array((0.03, -0.02, 0.0)), right.states.copy()
+    states[:, R_] -= v_mps * left_s
+    states[:, V_] += v_mps * (left_s > 0.0)
+    again = passed_about(dive, replace(right, states=states))
+    moved_m, left_m = (np.linalg.norm(one[0, R_] - right.states[0, R_]) for one in (states, again.states))
+    assert moved_m > 0.15
+    assert left_m < 0.02 * moved_m
+
+
+def dark_until(lit_ns: int, frame: FrameSeen) -> FrameSeen:
+    """Leave a frame without candidates before a time."""
+    if frame.stamp_ns >= lit_ns:
+        return frame
+    return replace(frame, pixels=frame.pixels[:0], sigma_px=frame.sigma_px[:0], lasting_s=frame.lasting_s[:0])
 
 
 def test_what_shaking_adds_to_the_covariance_stays_a_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
