@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import xml.etree.ElementTree as ET
 from itertools import pairwise
@@ -14,7 +15,7 @@ from buddyline.node.detect import make_detector
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.draw import errors, figures
 from buddyline.tools.draw.marks import mark_candidates, mark_lights, marked_svg
-from buddyline.tools.draw.page import page, section, table
+from buddyline.tools.draw.page import data_block, page, section, table
 
 from tests.node.rendered import lamp_picture
 from tests.tools.evaluated import OFFSET_PX, frame
@@ -144,3 +145,11 @@ def test_a_far_value_does_not_stretch_an_axis():
     low, high = figures.inner_limits(np.append(values, 50.0))
     assert 1.4 < low < 2.0
     assert 3.0 < high < 3.6
+
+
+def test_data_in_a_page_cannot_change_where_its_script_ends():
+    title = "<!--<script>alert(1)</script> \u2028"
+    block = data_block("numbers", {"title": title})
+    inside = block.removeprefix('<script type="application/json" id="numbers">').removesuffix("</script>")
+    assert "<" not in inside
+    assert json.loads(inside) == {"title": title}

@@ -57,8 +57,8 @@ def table(rows: Sequence[Sequence[str]], head: Sequence[str] = (), alarms: Seque
 
 def data_block(name: str, data: object) -> str:
     """Return data as JSON inside a page, for programs: `<script type="application/json" id="name">`."""
-    # Inside a script only `</` could end it early.
-    text = json.dumps(data, allow_nan=False).replace("</", "<\\/")
+    # `</script` would end the script, and after `<!--<script` its own end would not.
+    text = json.dumps(data, allow_nan=False).replace("<", "\\u003c")
     return f'<script type="application/json" id="{escape(name)}">{text}</script>'
 
 
