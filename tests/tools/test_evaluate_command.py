@@ -219,7 +219,7 @@ def test_plots_are_written_and_never_overwritten(tmp_path, capsys):
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in written)
     capsys.readouterr()
     assert "not empty" in refused(capsys, solved, "--plots", tmp_path / "plots")
-    assert "cannot be made" in refused(capsys, solved, "--plots", solved)
+    assert "exists and is no folder" in refused(capsys, solved, "--plots", solved)
 
 
 def test_plots_without_matplotlib_say_what_to_install(tmp_path, capsys, monkeypatch):
