@@ -12,7 +12,7 @@ from buddyline.tools.cli import main
 from tests.tools.evaluated import info, pose, track, truth, write_log
 
 
-class Terminal(io.StringIO):
+class ScreenText(io.StringIO):
     def isatty(self):
         return True
 
@@ -21,7 +21,7 @@ class Terminal(io.StringIO):
 def terminal(monkeypatch):
     """A terminal, for standard error; tasks count as long at once."""
     monkeypatch.setattr(progress, "SHOW_AFTER_S", -1.0)
-    return Terminal()
+    return ScreenText()
 
 
 def test_items_and_records_are_followed(terminal, tmp_path):

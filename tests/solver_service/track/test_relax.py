@@ -72,7 +72,7 @@ def test_a_pass_believes_nothing_of_where_its_path_has_a_dark_start() -> None:
     first = filter_of(dive.records, dive.fixes)
     pass_over(first, dive.records, dive.fixes)
     path, lit_ns = smoothed(parts_of(first)[0].steps), EPOCH_NS + 6_000_000_000
-    looks = [tuple(replace(look, chosen=look.chosen * (look.stamp_ns >= lit_ns)) for look in of) for of in path.looks]
+    looks = [tuple(look._replace(chosen=look.chosen * (look.stamp_ns >= lit_ns)) for look in of) for of in path.looks]
     a, b = (replace(one, frames=[dark_until(lit_ns, frame) for frame in one.frames]) for one in dive.records)
     dive, right = replace(dive, records=(a, b)), replace(path, looks=looks)
     for _ in range(4):
