@@ -47,7 +47,9 @@ def light_positions(
     r_m, v_mps = state.r_m[..., None, :], state.v_mps[..., None, :]
     # What the other node has turned on, or has yet to turn, by its own clock.
     late_s = np.asarray(state.clock_s if observer == 0 else -state.clock_s)[..., None]
-    R_observer = state.R[..., observer, None, :, :] @ turns_over(rates_radps[..., observer, :], times)
+    R_observer = state.R[..., observer, None, :, :]
+    if times.any():
+        R_observer = R_observer @ turns_over(rates_radps[..., observer, :], times)
     R_other = state.R[..., other, None, :, :] @ turns_over(rates_radps[..., other, :], times + late_s)
     arms = np.swapaxes(R_other @ lights_m.T, -1, -2)  # (T, L, 3)
     across = skew(rates_radps[..., other, :]) @ lights_m.T

@@ -22,7 +22,7 @@ from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.guessing import GuessedMotion
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.lamps import LampWatch
-from buddyline.solver_service.track.lights import COLUMNS, Sight, in_picture, pixel_of
+from buddyline.solver_service.track.lights import COLUMNS, Sight
 from buddyline.solver_service.track.moving import HOLD_S
 from buddyline.solver_service.track.records import Records
 from buddyline.solver_service.track.seeing import (
@@ -53,7 +53,7 @@ from buddyline.solver_service.track.strapdown import (
     sampled,
 )
 from buddyline.solver_service.track.trail import Look, Residuals, Step
-from buddyline.solver_service.track.visible import EDGE_PX, found_now, learn_found
+from buddyline.solver_service.track.visible import found_now, learn_found
 from buddyline.solver_service.track.walking import Walking
 
 # What is believed of the place at first, 1 sd: this share of the range, and at least so many of the path's sigmas. It
@@ -289,20 +289,19 @@ class PathPass(TrackSteps):
 
     def _associated(self, sight: Sight, by_path: BySight) -> Association:
         """Decide which of a picture's candidates are lights, by the path, or keep those that the path has."""
-        main, observer, camera = self.passed, sight.node, self.nodes[sight.node].rig.camera
+        main, observer = self.passed, sight.node
         if self._keeps:
             # What the path says of the others is not believed, nor is anything learned from it.
             kept = self.guides[observer, sight.stamp_ns].look.chosen
             return Association(in_front(kept, by_path.y), np.zeros(2), 0.0)
-        inside = [in_picture(camera, pixel_of(camera, X), EDGE_PX) for X in by_path.X]
         detection = found_now(main, observer, sight.t_s)
         # What is likely, but not sure, is taken where the next picture comes soon and tells whether it was right.
         slow = self.guessed is not None and sight.t_s - main.shown_s[observer] > SOON_S
         least = SURE if slow else LIKELY
         found = by_path.odds.associate(sight.sigma_px, detection, by_path.within, least)
         main.evidence += found.evidence
-        learn_found(main, observer, sight.t_s, detection, np.array(inside, float), found)
-        if all(inside):
+        learn_found(main, observer, sight.t_s, detection, by_path.inside.astype(float), found)
+        if by_path.inside.all():
             self.lamps.take(1 - observer, sight.t_s, found.seen)
         return found._replace(chosen=in_front(found.chosen, by_path.y))
 

@@ -44,7 +44,9 @@ from buddyline.solver_service.track.visible import (
     INSIDE,
     by_last_picture,
     found_now,
+    inside_of,
     learn_found,
+    pixels_of,
     share_within,
 )
 from numpy.typing import NDArray
@@ -79,15 +81,15 @@ class PassGuide:
 class BySight:
     """What a path says of one picture.
 
-    X (L, 3): the lights, camera frame. y (K, L, 2), H (K, L, 2, C): residuals and Jacobians. odds: its candidates',
-    within (L,): how likely each light is within it, both by the path without what the picture has told it.
+    y (K, L, 2), H (K, L, 2, C): residuals and Jacobians. odds: its candidates', within (L,): how likely each light is
+    within it, both by the path without what the picture has told it. inside (L,): whether each is, as the path has it.
     """
 
-    X: Floats
     y: Floats
     H: Floats
     odds: Odds
     within: Floats
+    inside: NDArray[np.bool_]
 
 
 class TrackSights(TrackMoves):
@@ -116,7 +118,9 @@ class TrackSights(TrackMoves):
         place = place_covariance(estimate.state, estimate.covariance)
         share = math.sqrt(place.trace()) / float(np.linalg.norm(estimate.state.r_m))
         wide, estimate.wide = share > 0.1, share > WIDE_SHARE
-        within = share_within(camera, X[0], D[0], with_stamp(estimate.covariance[BLOCK]), EDGE_PX)
+        within = share_within(
+            camera, pixels_of(camera, X[0]), X[0], D[0], with_stamp(estimate.covariance[BLOCK]), EDGE_PX
+        )
         inside = (within > INSIDE).tolist()
         guide = self.guides.get((observer, sight.stamp_ns))
         # A start that followed doubtful lights would seem better founded than it is.
@@ -228,8 +232,9 @@ class TrackSights(TrackMoves):
         y_without[~bearings.any(axis=2)] = np.inf
         camera, P = self.nodes[observer].rig.camera, with_stamp(P)
         odds = odds_of(y_without, H, P, sigma_px, np.array([sight.clutter / camera.area_px2 for _, sight in seen]))
-        within = share_within(camera, X[:, 0], D[:, 0], P, EDGE_PX)
-        return list(map(BySight, X[:, 0], y, H, odds, within))
+        at = pixels_of(camera, X[:, 0])
+        within = share_within(camera, at, X[:, 0], D[:, 0], P, EDGE_PX)
+        return list(map(BySight, y, H, odds, within, inside_of(camera, at, EDGE_PX)))
 
     def _about(
         self, estimate: Estimate, sight: Sight, chosen: Chosen, guide: PassGuide | None

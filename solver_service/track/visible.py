@@ -12,6 +12,7 @@ from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.association import Association
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.lights import SMALL_PX, Sight, light_positions, pixel_of
+from numpy.typing import NDArray
 
 # A light nearer to the picture's edge need not be found: part of its spot is outside. A light should be found whose
 # probability to be further inside is above INSIDE.
@@ -23,28 +24,38 @@ HIDDEN_S: Final = 1.0
 MOST_FOUND: Final = 0.97
 LEAST_FOUND: Final = 0.02
 FOUND_IN_VIEW: Final = math.sqrt(MOST_FOUND)
+_NOWHERE: Final = np.full(2, math.nan)
 
 
-def share_within(camera: Camera, X: Floats, D: Floats, P: Floats, margin_px: float) -> Floats:
+def pixels_of(camera: Camera, X: Floats) -> Floats:
+    """Give where points (..., 3) are imaged (..., 2), as `pixel_of` does; not a number where the camera cannot."""
+    pixels = [pixel_of(camera, each) for each in X.reshape(-1, 3)]
+    return np.array([_NOWHERE if at is None else at for at in pixels]).reshape(*X.shape[:-1], 2)
+
+
+def inside_of(camera: Camera, at: Floats, margin_px: float) -> NDArray[np.bool_]:
+    """Whether pixels (..., 2) lie in the picture, margin_px from its edges (...)."""
+    size_px = np.array((camera.width_px, camera.height_px))
+    return np.asarray(((at >= margin_px - 0.5) & (at <= size_px - 0.5 - margin_px)).all(axis=-1))
+
+
+def share_within(camera: Camera, at: Floats, X: Floats, D: Floats, P: Floats, margin_px: float) -> Floats:
     """Give how likely each light (..., L) lies within the picture, margin_px from its edges.
 
-    X (..., L, 3), D (..., L, 3, C): the lights and how errors of covariance P (..., C, C) move them, as
-    `light_positions` gives them. The errors of u and v are taken to be independent.
+    at (..., L, 2): its pixel, by `pixels_of`. X (..., L, 3), D (..., L, 3, C): the lights and how errors of covariance
+    P (..., C, C) move them, as `light_positions` gives them. The errors of u and v are taken to be independent.
     """
-    share = np.zeros(X.shape[:-1])
-    of_all = X.reshape(-1, 3)
-    pixels = {light: pixel for light, each in enumerate(of_all) if (pixel := pixel_of(camera, each)) is not None}
-    if not pixels:
-        return share
-    lights, at = list(pixels), np.array(list(pixels.values()))
-    _, tangents = camera.rays(at)
-    J = tangents @ D.reshape(-1, *D.shape[-2:])[lights] / np.sqrt((of_all[lights] ** 2).sum(axis=1))[:, None, None]
-    P_of_each = P.reshape(-1, *P.shape[-2:])[np.array(lights) // X.shape[-2]]
-    shares = share.reshape(-1)
-    for light, inside in zip(lights, _shares(camera, at, (J @ P_of_each * J).sum(axis=2), margin_px), strict=True):
+    shares = np.zeros(X.size // 3)
+    lights = np.flatnonzero(np.isfinite(at[..., 0]))
+    if len(lights):
+        pixels, of_all = at.reshape(-1, 2)[lights], X.reshape(-1, 3)[lights]
+        _, tangents = camera.rays(pixels)
+        J = tangents @ D.reshape(-1, *D.shape[-2:])[lights] / np.sqrt((of_all**2).sum(axis=1))[:, None, None]
+        P_of_each = P.reshape(-1, *P.shape[-2:])[lights // X.shape[-2]]
+        found = np.array(_shares(camera, pixels, (J @ P_of_each * J).sum(axis=2), margin_px))
         # The model of a distorted lens ends outside of the picture.
-        shares[light] = inside if inside > 0.0 else 0.0
-    return share
+        shares[lights] = np.where(found > 0.0, found, 0.0)
+    return shares.reshape(X.shape[:-1])
 
 
 def share_before(

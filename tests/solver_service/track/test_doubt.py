@@ -23,7 +23,7 @@ from buddyline.solver_service.track.lights import (
 )
 from buddyline.solver_service.track.state import GYRO_BIAS, MOVING, PHI, SIZE, invariant_of_plain
 from buddyline.solver_service.track.sudden import SuddenTurn, with_sudden
-from buddyline.solver_service.track.visible import share_before, share_within
+from buddyline.solver_service.track.visible import pixels_of, share_before, share_within
 
 from tests.solver_service.track.dives import Setting, bare_of, filter_of, make, project
 
@@ -146,7 +146,7 @@ def test_the_share_of_a_light_within_the_picture(camera: Camera, pixel: tuple[fl
     X = 6.0 * camera.bearings(np.array((pixel,)))
     root = rng.normal(0.0, 0.08, (3, 3))
     D = np.eye(3)[None]
-    share = share_within(camera, X, D, root @ root.T, 2.0)
+    share = share_within(camera, pixels_of(camera, X), X, D, root @ root.T, 2.0)
     drawn = [pixel_of(camera, X[0] + root @ rng.normal(0.0, 1.0, 3)) for _ in range(4000)]
     inside = np.mean([in_picture(camera, one, 2.0) for one in drawn])
     assert share[0] == pytest.approx(inside, abs=0.06)
@@ -155,7 +155,7 @@ def test_the_share_of_a_light_within_the_picture(camera: Camera, pixel: tuple[fl
 def test_a_light_behind_the_camera_is_not_within_the_picture() -> None:
     camera = Camera("pinhole", 820, 616, 900.0, 900.0, 409.5, 307.5)
     X = np.array(((0.0, 0.0, -3.0), (0.0, 0.0, 3.0)))
-    share = share_within(camera, X, np.broadcast_to(np.eye(3), (2, 3, 3)), 1e-4 * np.eye(3), 2.0)
+    share = share_within(camera, pixels_of(camera, X), X, np.broadcast_to(np.eye(3), (2, 3, 3)), 1e-4 * np.eye(3), 2.0)
     assert share.tolist() == [0.0, 1.0]
 
 
