@@ -244,8 +244,9 @@ def _span(dive: Dive, start_s: float, end_s: float | None) -> tuple[int, int]:
 def _selected(dive: Dive, start_ns: int, stop_ns: int) -> Iterator[Envelope]:
     """Yield the messages to send, between start_ns and stop_ns, and calibrations from before start_ns.
 
-    What stands in two logs, as in a dive and the solved dive, is sent once.
+    What stands in two logs, as in a dive and the solved dive, is sent once. What stands twice in one was sent twice.
     """
+    several = len(dive.readers) > 1
     sent: set[tuple[str, bytes]] = set()
     at_ns = -1
     for envelope in dive.messages(*SENT):
@@ -254,7 +255,7 @@ def _selected(dive: Dive, start_ns: int, stop_ns: int) -> Iterator[Envelope]:
         if envelope.time_ns != at_ns:
             sent.clear()
             at_ns = envelope.time_ns
-        if (envelope.key, envelope.payload) in sent:
+        if several and (envelope.key, envelope.payload) in sent:
             continue
         sent.add((envelope.key, envelope.payload))
         if envelope.time_ns >= start_ns or envelope.topic is INFO:

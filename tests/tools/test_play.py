@@ -74,6 +74,17 @@ def test_what_stands_in_two_logs_is_sent_once(log, tmp_path):
     assert sorted((one.key, one.payload) for one in twice) == sorted((one.key, one.payload) for one in once)
 
 
+def test_what_stands_twice_in_one_log_is_sent_twice(log, tmp_path):
+    doubled = tmp_path / "doubled.mcap"
+    with Dive([log]) as dive, DiveLogWriter(doubled) as writer:
+        once = list(_selected(dive, *_span(dive, 0.0, None)))
+        for one in once:
+            for _ in range(2):
+                writer.write_message(one.message, one.time_ns)
+    with Dive([doubled]) as dive:
+        assert len(list(_selected(dive, *_span(dive, 0.0, None)))) == 2 * len(once)
+
+
 def test_the_playback_rate_follows_speed(log):
     assert Played(log).clock.now_ns() - 5 == pytest.approx(1.98e9, abs=1e8)
     assert Played(log, speed=4.0).clock.now_ns() - 5 == pytest.approx(1.98e9 / 4, abs=3e7)
