@@ -10,8 +10,9 @@ import pytest
 
 # Ten minutes must fit into 300 MB, of which what does not grow takes some 90. Measured: 0.30 MB/s.
 MOST_MB_PER_S = (300.0 - 90.0) / 600.0
-# Of both the beginning is passed over first, for the clocks: of dives beyond three minutes.
-SECONDS = 200, 320
+# Of both the beginning is passed over first, for the clocks: of dives beyond three minutes. Peaks of a dive of 320 s
+# vary by 10 MB from run to run: over two minutes that is a quarter of what is asked, over four an eighth.
+SECONDS = 200, 440
 PEAK = """
 import resource, subprocess, sys
 status = subprocess.run([sys.executable, "-m", "buddyline.tools.cli", *sys.argv[1:]]).returncode
