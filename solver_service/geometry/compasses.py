@@ -91,24 +91,15 @@ class LeaveOneOut:
     @classmethod
     def of(cls, off_rad: Floats, variances: Floats, covariance: Floats) -> LeaveOneOut:
         """Leave out each of some compasses; the arguments are those of `north_doubt`."""
-        weights, about_mean = _weighed(variances, covariance)
+        inverse = np.linalg.inv(covariance + np.diag(variances))
+        weights = inverse.sum(axis=0) / inverse.sum()
+        about_mean = inverse - inverse.sum() * np.outer(weights, weights)
         told = about_mean @ off_rad
         gaps = told / np.maximum(np.diag(about_mean), 1e-12)
         chi2 = float(off_rad @ told)
         left = chi2 - told * gaps
         likely = variances * np.exp(0.5 * (left.min() - left))
         return cls(gaps, weights @ off_rad - weights * gaps, left, likely / likely.sum(), chi2)
-
-
-def _weighed(variances: Floats, covariance: Floats) -> tuple[Floats, Floats]:
-    """Give the weights (n,) of compasses in their mean, and how what each is off counts in their chi^2 about it (n, n).
-
-    The arguments are those of `north_doubt`.
-    """
-    inverse = np.linalg.inv(covariance + np.diag(variances))
-    total = inverse.sum()
-    weights = inverse.sum(axis=0) / total
-    return weights, inverse - total * np.outer(weights, weights)
 
 
 def wrong_compass(off_rad: Floats, variances: Floats, covariance: Floats) -> tuple[int, float] | None:
@@ -132,9 +123,9 @@ def north_doubt(off_rad: Floats, variances: Floats, covariance: Floats) -> float
     Data Group widens what measurements tell that do not agree. Of two whose weighted mean is told, all of it is that.
     """
     free = len(off_rad) - 1
-    if off_rad @ _weighed(variances, covariance)[1] @ off_rad <= free:
-        return 0.0
     without = LeaveOneOut.of(off_rad, variances, covariance)
+    if without.chi2 <= free:
+        return 0.0
     left = np.maximum(without.chi2_left / max(free - 1, 1) - 1.0, 0.0)
     apart = without.norths_rad**2 + left / ((1.0 / variances).sum() - 1.0 / variances)
     return (1.0 - free / without.chi2) * float(without.wrong @ apart)

@@ -23,7 +23,7 @@ from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.association import Odds, doubt_of, odds_of
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.intake import TrackIntake, newest_before
-from buddyline.solver_service.track.lights import Sight, in_picture, lasting_factor, pixel_of, residuals, with_stamp
+from buddyline.solver_service.track.lights import Sight, in_picture, lasting_factor, pixels_of, residuals, with_stamp
 from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S
 from buddyline.solver_service.track.seeing import noise_of
 from buddyline.solver_service.track.start import tilt_of
@@ -163,10 +163,11 @@ class NetEstimate(NetBelief):
         if wide:
             return True, True
         camera = self.nodes[bar.sight.node].rig.camera
-        left, right = (pixel_of(camera, light) for light in X)
-        if not (in_picture(camera, left, -OUTSIDE_PX) or in_picture(camera, right, -OUTSIDE_PX)):
+        at = pixels_of(camera, X)
+        if not in_picture(camera, at, -OUTSIDE_PX).any():
             return None
-        return in_picture(camera, left, EDGE_PX), in_picture(camera, right, EDGE_PX)
+        left, right = in_picture(camera, at, EDGE_PX).tolist()
+        return left, right
 
     def _associate(
         self, bars: Sequence[Bar], odds: Sequence[Odds], inside: NDArray[np.bool_]

@@ -166,16 +166,16 @@ class TrackIntake:
         if t_s - self._checked_s < CHECK_EVERY_S:
             return
         # At the dive's start there is little to judge by: at every picture, until there is enough.
-        if min(len(samples.last(t_s, CHECK_EVERY_S)) for samples in self.samples) > 100:
+        if min(len(samples.last(t_s, CHECK_EVERY_S)[0]) for samples in self.samples) > 100:
             self._checked_s = t_s
         if t_s - self._compared_s > EVERY_S:
             self._compared_s = t_s
             self._compare_gyros(t_s)
         for node, samples in enumerate(self.samples):
-            name, lately = self.nodes[node].name, samples.last(t_s, CHECK_EVERY_S)
+            name, (times_s, lately) = self.nodes[node].name, samples.last(t_s, CHECK_EVERY_S)
             unchanging, found = stuck(name, lately), self._fault_found(node, t_s)
             if unchanging is None:
-                fault = fault_of(name, *self._lately_forced(node, t_s)) or found
+                fault = fault_of(name, *self._with_attitudes(node, t_s, times_s, lately[:, :3])) or found
             else:
                 fault = found if found and node in self._known_faults else unchanging
                 if samples.trusted:
@@ -184,7 +184,7 @@ class TrackIntake:
             if fault is not None:
                 self._problems.report(fault, t_s)
                 self._rejected[node] = samples.rejected
-            elif len(samples) and not (len(samples.last(t_s + SILENT_S, 2.0 * SILENT_S)) or self.gone(node, t_s)):
+            elif len(samples) and not (len(samples.last(t_s + SILENT_S, 2.0 * SILENT_S)[0]) or self.gone(node, t_s)):
                 self._problems.report(f"node {name}: inertial samples are missing: the track does without them", t_s)
             if samples.rejected > self._rejected[node]:
                 said = (
@@ -194,13 +194,13 @@ class TrackIntake:
                 self._problems.report(said, t_s)
                 self._rejected[node] = samples.rejected
 
-    def _lately_forced(self, node: int, t_s: float) -> tuple[Floats, Floats | None]:
-        """Give the force (N, 3) of the last seconds' samples, and R_level_camera (N, 3, 3) at each by the attitudes.
+    def _with_attitudes(self, node: int, t_s: float, times_s: Floats, force: Floats) -> tuple[Floats, Floats | None]:
+        """Give the forces (N, 3) of the last seconds up to t_s with R_level_camera (N, 3, 3) at each, by the attitudes.
 
-        Samples later than an attitude by ATTITUDE_HOLD_S are left out; no R where the newest one is that old.
+        Forces are left out where the attitude before them is older than ATTITUDE_HOLD_S. All are given, without R,
+        where the newest attitude is that old at t_s.
         """
         start_s, items = t_s - CHECK_EVERY_S, self.attitudes[node]
-        times_s, force = self.samples[node].last_forced(t_s, CHECK_EVERY_S)
         first = bisect.bisect_left(items, start_s - ATTITUDE_HOLD_S, key=time_of)
         seen = items[first : bisect.bisect_right(items, t_s, key=time_of)]
         if not seen or t_s - seen[-1][0] >= ATTITUDE_HOLD_S:
@@ -263,7 +263,7 @@ class TrackIntake:
         if t_s - pictured_s <= max(GONE_S, GONE_PICTURES * apart_s):
             return False
         seen = newest_before(self.attitudes[node], t_s)
-        return (seen is None or t_s - seen[0] > GONE_S) and not len(self.samples[node].last(t_s, GONE_S))
+        return (seen is None or t_s - seen[0] > GONE_S) and not len(self.samples[node].last(t_s, GONE_S)[0])
 
     def goes_on_to(self, t_s: float) -> None:
         """Note that the dive goes on up to t_s, where problems that were found before may have ended."""

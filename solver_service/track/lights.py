@@ -14,6 +14,7 @@ from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, skew
 from buddyline.solver_service.track.inputs import FrameSeen
 from buddyline.solver_service.track.state import CLOCK, NAV, State
+from numpy.typing import NDArray
 
 # The errors that move a light in a picture: NAV of them, and the clock's; and their part of a covariance.
 COLUMNS: Final = np.array((*range(NAV), CLOCK))
@@ -22,6 +23,7 @@ BLOCK: Final = np.ix_(COLUMNS, COLUMNS)
 SMALL_PX: Final = 1e-4
 # No camera takes its pictures faster.
 LEAST_APART_S: Final = 1e-3
+_NOWHERE: Final = np.full(2, math.nan)
 
 
 def light_positions(
@@ -47,9 +49,7 @@ def light_positions(
     r_m, v_mps = state.r_m[..., None, :], state.v_mps[..., None, :]
     # What the other node has turned on, or has yet to turn, by its own clock.
     late_s = np.asarray(state.clock_s if observer == 0 else -state.clock_s)[..., None]
-    R_observer = state.R[..., observer, None, :, :]
-    if times.any():
-        R_observer = R_observer @ turns_over(rates_radps[..., observer, :], times)
+    R_observer = state.R[..., observer, None, :, :] @ turns_over(rates_radps[..., observer, :], times)
     R_other = state.R[..., other, None, :, :] @ turns_over(rates_radps[..., other, :], times + late_s)
     arms = np.swapaxes(R_other @ lights_m.T, -1, -2)  # (T, L, 3)
     across = skew(rates_radps[..., other, :]) @ lights_m.T
@@ -103,15 +103,16 @@ def residuals(bearings: Floats, tangents: Floats, X: Floats, D: Floats) -> tuple
     return y, H
 
 
-def in_picture(camera: Camera, pixel_px: Floats | None, margin_px: float = 0.0) -> bool:
-    """Whether a pixel (2,) lies in the picture, margin_px from its edges; None does not."""
-    if pixel_px is None:
-        return False
-    u, v = pixel_px.tolist()
-    return bool(
-        -0.5 + margin_px <= u <= camera.width_px - 0.5 - margin_px
-        and -0.5 + margin_px <= v <= camera.height_px - 0.5 - margin_px
-    )
+def in_picture(camera: Camera, at: Floats, margin_px: float = 0.0) -> NDArray[np.bool_]:
+    """Whether pixels (..., 2) lie in the picture (...), margin_px from its edges; what is not a number does not."""
+    size_px = np.array((camera.width_px, camera.height_px))
+    return np.asarray(((at >= margin_px - 0.5) & (at <= size_px - 0.5 - margin_px)).all(axis=-1))
+
+
+def pixels_of(camera: Camera, X: Floats) -> Floats:
+    """Give where points (..., 3) are imaged (..., 2), as `pixel_of` does; not a number where the camera cannot."""
+    pixels = [pixel_of(camera, each) for each in X.reshape(-1, 3)]
+    return np.array([_NOWHERE if at is None else at for at in pixels]).reshape(*X.shape[:-1], 2)
 
 
 def pixel_of(camera: Camera, X: Floats) -> Floats | None:

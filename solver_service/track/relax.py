@@ -225,7 +225,7 @@ class PathPass(TrackSteps):
         else:
             F, walk, missed = told.F, told.walk, told.missed
             learned = main.shaking.variances / self._shaking
-            Q = told.Q + ((learned + told.lost - 1.0) @ told.shaken.reshape(3, -1)).reshape(told.Q.shape)
+            Q = told.Q + np.tensordot(learned + told.lost - 1.0, told.shaken, 1)
             onward = F[:, :MOVING]
             main.shaken = onward @ main.shaken @ onward.T + learned[:, None, None] * told.shaken
             main.by_shaking = onward @ main.by_shaking

@@ -265,15 +265,10 @@ class Samples:
         last = int(np.searchsorted(self.times_s, known_s, side="right"))
         return self.trusted and last > 0 and bool(self._t[last - 1] > time_s - 1.0)
 
-    def last(self, time_s: float, span_s: float) -> Floats:
-        """Give the values (N, 6) of the last span_s up to time_s."""
+    def last(self, time_s: float, span_s: float) -> tuple[Floats, Floats]:
+        """Give the times (N,) and the values (N, 6) of the last span_s up to time_s."""
         first, stop = np.searchsorted(self.times_s, (time_s - span_s, time_s))
-        return self._values[first:stop, :6]
-
-    def last_forced(self, time_s: float, span_s: float) -> tuple[Floats, Floats]:
-        """Give the times (N,) and the forces (N, 3) of the last span_s up to time_s."""
-        first, stop = np.searchsorted(self.times_s, (time_s - span_s, time_s))
-        return self.times_s[first:stop], self._values[first:stop, :3]
+        return self.times_s[first:stop], self._values[first:stop, :6]
 
     def noise(self, time_s: float) -> Noise:
         """Give the samples' noise as densities, from their third differences over the last seconds.

@@ -18,8 +18,10 @@ from buddyline.solver_service.track.lights import (
     BLOCK,
     COLUMNS,
     Sight,
+    in_picture,
     lasting_factor,
     light_positions,
+    pixels_of,
     residuals,
     with_stamp,
 )
@@ -44,9 +46,7 @@ from buddyline.solver_service.track.visible import (
     INSIDE,
     by_last_picture,
     found_now,
-    inside_of,
     learn_found,
-    pixels_of,
     share_within,
 )
 from numpy.typing import NDArray
@@ -234,7 +234,7 @@ class TrackSights(TrackMoves):
         odds = odds_of(y_without, H, P, sigma_px, np.array([sight.clutter / camera.area_px2 for _, sight in seen]))
         at = pixels_of(camera, X[:, 0])
         within = share_within(camera, at, X[:, 0], D[:, 0], P, EDGE_PX)
-        return list(map(BySight, y, H, odds, within, inside_of(camera, at, EDGE_PX)))
+        return list(map(BySight, y, H, odds, within, in_picture(camera, at, EDGE_PX)))
 
     def _about(
         self, estimate: Estimate, sight: Sight, chosen: Chosen, guide: PassGuide | None

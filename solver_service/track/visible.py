@@ -12,7 +12,6 @@ from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.association import Association
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.lights import SMALL_PX, Sight, light_positions, pixel_of
-from numpy.typing import NDArray
 
 # A light nearer to the picture's edge need not be found: part of its spot is outside. A light should be found whose
 # probability to be further inside is above INSIDE.
@@ -24,19 +23,6 @@ HIDDEN_S: Final = 1.0
 MOST_FOUND: Final = 0.97
 LEAST_FOUND: Final = 0.02
 FOUND_IN_VIEW: Final = math.sqrt(MOST_FOUND)
-_NOWHERE: Final = np.full(2, math.nan)
-
-
-def pixels_of(camera: Camera, X: Floats) -> Floats:
-    """Give where points (..., 3) are imaged (..., 2), as `pixel_of` does; not a number where the camera cannot."""
-    pixels = [pixel_of(camera, each) for each in X.reshape(-1, 3)]
-    return np.array([_NOWHERE if at is None else at for at in pixels]).reshape(*X.shape[:-1], 2)
-
-
-def inside_of(camera: Camera, at: Floats, margin_px: float) -> NDArray[np.bool_]:
-    """Whether pixels (..., 2) lie in the picture, margin_px from its edges (...)."""
-    size_px = np.array((camera.width_px, camera.height_px))
-    return np.asarray(((at >= margin_px - 0.5) & (at <= size_px - 0.5 - margin_px)).all(axis=-1))
 
 
 def share_within(camera: Camera, at: Floats, X: Floats, D: Floats, P: Floats, margin_px: float) -> Floats:

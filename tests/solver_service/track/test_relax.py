@@ -63,7 +63,7 @@ def test_passes_about_a_path_that_is_off_end_at_the_same_path() -> None:
     assert moved(path, right) < 0.01
 
 
-def test_a_pass_believes_nothing_of_where_its_path_has_a_dark_start() -> None:
+def test_a_pass_believes_little_of_where_its_path_begins_in_the_dark() -> None:
     """It is what the pass before made of the same lights and samples: believed, they would count twice.
 
     Before the first light samples alone tell the place, linearly. So one pass comes back to the same path.
