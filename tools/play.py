@@ -244,19 +244,17 @@ def _span(dive: Dive, start_s: float, end_s: float | None) -> tuple[int, int]:
 def _selected(dive: Dive, start_ns: int, stop_ns: int) -> Iterator[Envelope]:
     """Yield the messages to send, between start_ns and stop_ns, and calibrations from before start_ns.
 
-    What stands in two logs, as in a dive and the solved dive, is sent once. What stands twice in one was sent twice.
+    What stands in two logs, as in a dive and the solved dive, is sent once. What stands twice in one log is sent twice.
     """
-    several = len(dive.readers) > 1
-    sent: set[tuple[str, bytes]] = set()
-    at_ns = -1
+    sent, at_ns = set[tuple[str, bytes]](), -1
     for envelope in dive.messages(*SENT):
         if envelope.time_ns >= stop_ns:
             return
-        if envelope.time_ns != at_ns:
-            sent.clear()
-            at_ns = envelope.time_ns
-        if several and (envelope.key, envelope.payload) in sent:
-            continue
-        sent.add((envelope.key, envelope.payload))
+        if len(dive.readers) > 1:
+            if envelope.time_ns != at_ns:
+                sent, at_ns = set(), envelope.time_ns
+            if (envelope.key, envelope.payload) in sent:
+                continue
+            sent.add((envelope.key, envelope.payload))
         if envelope.time_ns >= start_ns or envelope.topic is INFO:
             yield envelope

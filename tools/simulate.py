@@ -155,12 +155,12 @@ def _check_effect(args: argparse.Namespace) -> None:
     }
     for option, field in IN_PICTURES.items():
         if not args.images and getattr(args, field) != usual[field]:
-            raise BuddylineError(f"{option}: is seen in pictures alone; add --images")
+            raise BuddylineError(f"{option}: changes pictures only; add --images")
     for option, field in OF_CANDIDATES.items():
         if args.images and getattr(args, field) != getattr(scenario, field):
-            raise BuddylineError(f"{option}: is of synthetic candidates, which a dive with --images has not")
+            raise BuddylineError(f"{option}: changes synthetic candidates only; leave out --images")
     if args.inertial != scenario.inertial and not args.imu:
-        raise BuddylineError(f"--inertial {args.inertial}: is of inertial samples; add --imu")
+        raise BuddylineError(f"--inertial {args.inertial}: changes inertial samples only; add --imu")
 
 
 def _given(args: argparse.Namespace, kind: type[Scenario | DivePlan]) -> dict[str, Any]:

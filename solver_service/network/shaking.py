@@ -24,7 +24,8 @@ from buddyline.solver_service.track.shaking import (
     nothing_learned,
 )
 
-# An update's weight is halved after so many more for each member: one update takes all pictures of a trigger.
+# An update's weight is halved after this number of updates times that of members; one update takes all pictures of a
+# trigger.
 HALVED: Final = 100.0
 _FIRST, *_BOUNDS = (np.array((logs[0], logs[2])) for logs in (FIRST_LOGS, LEAST, MOST))
 _I: Final = np.eye(3)

@@ -42,8 +42,8 @@ LEAST_WINDOW_S: Final = 13.5
 WINDOW_EVERY_S: Final = 3.0
 LIT: Final = 0.9
 UNLIT: Final = 0.05
-# A start that waits for the other node takes each of its candidates within this chi^2 (2 degrees of freedom) for either
-# light; before the picture each was as likely as this.
+# A start that waits for the other node is followed with each of its candidates as each light, where chi^2 (2 degrees of
+# freedom) is below the gate. The share is the prior probability of each.
 FORK_GATE: Final = 12.0
 FORK_SHARE: Final = 0.2
 # The noise of the lights that a start is made of: one in thirty is off by many pixels.

@@ -56,9 +56,9 @@ from buddyline.solver_service.track.trail import Look, Residuals, Step
 from buddyline.solver_service.track.visible import found_now, learn_found
 from buddyline.solver_service.track.walking import Walking
 
-# What is believed of the place at first, 1 sd: this share of the range, and at least so many of the path's sigmas. It
-# is centred where the path begins, which the same lights and samples have told: what is believed counts them twice.
-# With far more sigmas rounding would spoil the first steps.
+# The prior of the first place has this share of the range as sigma, and at least so many of the path's sigmas. It is
+# centred where the path begins, which the same lights and samples have told: a narrow prior would count them twice.
+# With a far wider one rounding would spoil the first steps.
 BROAD_SHARE: Final = 0.5
 PATH_SIGMAS: Final = 10.0
 # Where motion is guessed, and pictures are further apart than this, the next one tells little of this one.

@@ -154,13 +154,14 @@ def _tags(args: argparse.Namespace) -> int:
 
 
 def _legs(args: argparse.Namespace) -> int:
+    from buddyline.tools.newfile import check_new
     from buddyline.tools.survey.derive import Derived
     from buddyline.tools.survey.gauges import adjust_gauges
     from buddyline.tools.survey.marks import of_project, of_table
     from buddyline.tools.survey.project import (
+        ANOTHER_DIVE,
         Made,
         beside,
-        check_project,
         load_project,
         new_project,
         own_equates,
@@ -173,7 +174,7 @@ def _legs(args: argparse.Namespace) -> int:
     read: dict[int, list[PairReadings]] = {}
     if args.dive:
         # What cannot be read begins no project, so that the next call may have the same name.
-        check_project(path)
+        check_new(path, ANOTHER_DIVE)
         read[1] = of_logs(args.dive)
         new_project(path, path.stem, [beside(path, log) for log in args.dive])
     project = load_project(path)

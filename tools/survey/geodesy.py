@@ -207,18 +207,26 @@ def _somewhere(project: Project) -> tuple[float, float] | None:
     return None
 
 
+def _metres_from(origin: tuple[float, float], place: tuple[float, float]) -> tuple[float, float]:
+    """Return how far east and north a place is of an origin near it, both latitude and longitude in degrees."""
+    per_longitude_m, per_latitude_m = radii_m(origin[0])
+    return (
+        # Longitudes differ by less than half a turn, also where +180 and -180 degrees meet.
+        math.radians(math.remainder(place[1] - origin[1], 360)) * per_longitude_m,
+        math.radians(place[0] - origin[0]) * per_latitude_m,
+    )
+
+
 def _check_near(project: Project, projection: Projection) -> None:
     """Raise ConfigError for a fixed point in metres far from the stated place: exchanged, or of another grid."""
     place = project.place.degrees
-    for fix in project.fix if place is not None else ():
-        if place is None or fix.metres is None:
+    if place is None:
+        return
+    for fix in project.fix:
+        if fix.metres is None:
             continue
         latitude_deg, longitude_deg = projection.degrees(*fix.metres)
-        per_longitude_m, per_latitude_m = radii_m(place[0])
-        away_m = math.hypot(
-            math.radians(latitude_deg - place[0]) * per_latitude_m,
-            math.radians(math.remainder(longitude_deg - place[1], 360)) * per_longitude_m,
-        )
+        away_m = math.hypot(*_metres_from(place, (latitude_deg, longitude_deg)))
         if away_m > FAR_M:
             east_m, north_m = fix.metres
             raise ConfigError(
@@ -297,12 +305,7 @@ class Grid:
             return self.projection.metres(*fix.degrees)
         if self.origin is None:
             return 0.0, 0.0
-        per_longitude_m, per_latitude_m = radii_m(self.origin[0])
-        return (
-            # Longitudes differ by less than half a turn, also where +180 and -180 degrees meet.
-            math.radians(math.remainder(fix.degrees[1] - self.origin[1], 360)) * per_longitude_m,
-            math.radians(fix.degrees[0] - self.origin[0]) * per_latitude_m,
-        )
+        return _metres_from(self.origin, fix.degrees)
 
 
 def grid_of(project: Project) -> Grid:

@@ -22,7 +22,7 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import Config, ConfigError, load_config
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NodeId, NonNegative, Positive
-from buddyline.tools.newfile import check_new, write_new
+from buddyline.tools.newfile import write_new
 from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
 from msgspec import UNSET, Meta, UnsetType, field
 
@@ -445,11 +445,6 @@ def _write_again(path: Path, text: str, old: str) -> None:
 def beside(path: Path, file: Path | str) -> str:
     """Return a file's name relative to the folder of a project, to which a link may lead."""
     return os.path.relpath(os.path.abspath(file), path.parent.resolve())
-
-
-def check_project(path: Path) -> None:
-    """Raise BuddylineError if a project cannot be begun, because it exists."""
-    check_new(path, ANOTHER_DIVE)
 
 
 def new_project(path: Path, name: str, logs: list[str], old: Sequence[OldFile] = ()) -> None:

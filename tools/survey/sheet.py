@@ -17,6 +17,7 @@ from buddyline.tools.survey.marks import section_of
 from buddyline.tools.survey.network import Adjusted
 from buddyline.tools.survey.old.joining import leg_of, same_place
 from buddyline.tools.survey.old.model import CrossSection, North, OldShot, OldSurvey, merged
+from buddyline.tools.survey.old.writing import one_line
 from buddyline.tools.survey.project import Leg, Project
 from msgspec import UNSET, structs
 
@@ -65,11 +66,6 @@ def remark_on(leg: Leg) -> str:
     if leg.depth_from_m is not UNSET and leg.depth_to_m is not UNSET:
         words.append(f"gauges {leg.depth_from_m:.2f} {leg.depth_to_m:.2f}")
     return " ".join(words + ["ALARM " + "; ".join(leg.alarms)] * bool(leg.alarms))
-
-
-def one_line(text: str) -> str:
-    """Return text on one line: what follows a line end would be a line of data in another program's file."""
-    return " ".join(text.splitlines())
 
 
 class Sheet:

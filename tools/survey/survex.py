@@ -14,6 +14,7 @@ from buddyline.tools.survey.old.writing import (
     TH,
     InForce,
     Written,
+    one_line,
     quoted,
     survex_system,
     svx_of,
@@ -22,7 +23,7 @@ from buddyline.tools.survey.old.writing import (
     therion_person,
     therion_system,
 )
-from buddyline.tools.survey.sheet import Reading, Sheet, one_line, remark_on
+from buddyline.tools.survey.sheet import Reading, Sheet, remark_on
 
 
 @dataclass(frozen=True)

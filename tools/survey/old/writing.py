@@ -90,9 +90,14 @@ class _Names:
         return self.home[name]
 
 
+def one_line(text: str) -> str:
+    """Return text on one line: what follows a line end would be a line of data in another program's file."""
+    return " ".join(text.splitlines())
+
+
 def quoted(text: str) -> str:
-    """Return text in quotes; quotes in it are replaced."""
-    return '"' + " ".join(text.replace('"', "'").splitlines()) + '"'
+    """Return text in quotes, on one line; quotes in it are replaced."""
+    return '"' + one_line(text.replace('"', "'")) + '"'
 
 
 def therion_person(name: str) -> str:
