@@ -5,11 +5,11 @@
     .venv/bin/python -m tests.net_figures --basin                        # a fixed pair of nodes and a moving one, 20 Hz
 
 The joint bound is what the same filter, or smoother, states when it is told the simulator's own sigmas of the units'
-biases and their walks, mounts, lever arms and delays, and that clocks and gauges are right. Its own errors over it, and
-its NEES, stand beside ours: by how far they are from 1 is chance, which both share. Gross errors of lights that pass
-add 0.03 to 0.08 to NEES. The last node and b stand side by side, do not see each other, and are placed by others
-(`b-d`); their composed bound is that of both places together, as if independent. A dive of 10 s takes about a quarter
-of a minute of CPU.
+biases and their walks, mounts, lever arms and delays, and that clocks, gauges and the water's density are right. Its
+own errors over it, and its NEES, stand beside ours: by how far they are from 1 is chance, which both share. Gross
+errors of lights that pass add 0.03 to 0.08 to NEES. The last node and b stand side by side, do not see each other, and
+are placed by others (`b-d`); their composed bound is that of both places together, as if independent. A dive of 10 s
+takes about a quarter of a minute of CPU.
 """
 
 from __future__ import annotations
@@ -142,9 +142,10 @@ def told(grade: Grade) -> Iterator[None]:
         "MOUNT_RAD": grade.misalignment_rad / math.sqrt(3.0),
         "LEVER_TOLD_M": grade.lever_sigma_m,
         "DELAY_UNTOLD_S": max(math.hypot((least_s + most_s) / 2, (most_s - least_s) / math.sqrt(12.0)), 1e-6),
-        # The simulator's clocks and gauges are right.
+        # The simulator's clocks, gauges and density are right.
         "CLOCK_S": 1e-6,
         "GAUGE_M": 1e-5,
+        "DEPTH_SCALE_SIGMA": 1e-6,
     }
     shaken: dict[str, Any] = {}
     if not grade.shake_radps:

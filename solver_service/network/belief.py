@@ -16,7 +16,8 @@ from buddyline.solver_service.network.shaking import NetShaking
 from buddyline.solver_service.network.state import (
     BLOCK,
     CLOCK,
-    DATUM_M,
+    DATUM,
+    DEPTH_SCALE,
     GAUGE,
     GYRO_BIAS,
     MOUNT,
@@ -30,6 +31,7 @@ from buddyline.solver_service.network.state import (
     NetState,
     block,
     blocks,
+    common_variances,
     lone,
 )
 from buddyline.solver_service.network.trail import Chosen, Grown, Learned, NetTrail
@@ -164,7 +166,7 @@ class NetBelief:
         if self.trail is not None:
             self.trail.events.append(Grown(np.zeros((BLOCK, len(self.covariance))) if by is None else by))
         if self.state is None:
-            self.state, self.covariance = state, np.array(((DATUM_M**2,),))
+            self.state, self.covariance = state, np.diag(common_variances())
             # The net's clock is the first member's.
             own[CLOCK, :] = own[:, CLOCK] = 0.0
         else:
@@ -369,20 +371,24 @@ class NetBelief:
                 member.depth_s = found[0]
                 news.append((index, self.t_s - found[0], found[1]))
         # Beside a variance as that of an unknown datum, together they would lose all digits of their own.
-        together = self.covariance[0, 0] < KNOWN_DATUM_M**2
+        together = self.covariance[DATUM, DATUM] < KNOWN_DATUM_M**2
         for some in [news] if together else [[one] for one in news]:
             self._take_gauges(some)
 
     def _take_gauges(self, news: Sequence[tuple[int, float, DepthSeen]]) -> None:
-        """Update by some gauges in one: h = p_z + (R port)_z - v_z age + offset + datum. news: member, age, message."""
+        """Update by some gauges in one: (1 - scale) h = p_z + (R port)_z - v_z age + offset + datum.
+
+        news: member, age, message.
+        """
         assert self.state is not None
         state = self.state
         y, noise, H = np.zeros(len(news)), np.zeros(len(news)), np.zeros((len(news), len(self.covariance)))
-        H[:, 0] = 1.0
+        H[:, DATUM] = 1.0
         for row, (index, age_s, seen) in enumerate(news):
             port = state.R[index] @ self.nodes[self.members[index].node].rig.depth_port_m
             north, east, down = (state.p_m[index] - age_s * state.v_mps[index] + port).tolist()
-            y[row] = seen.depth_m - down - state.gauge_m[index] - state.datum_m
+            y[row] = (1.0 - state.depth_scale) * seen.depth_m - down - state.gauge_m[index] - state.datum_m
+            H[row, DEPTH_SCALE] = seen.depth_m
             own = H[row, block(index)]
             own[P_.stop - 1], own[V_.stop - 1] = 1.0, -age_s
             own[PHI] = east, -north, 0.0

@@ -12,6 +12,8 @@ from buddyline.solver_service.network.shaking import shaking_parts
 from buddyline.solver_service.network.state import (
     ACCEL_BIAS,
     BLOCK,
+    COMMON,
+    DATUM,
     DELAY,
     GYRO_BIAS,
     LEVER,
@@ -61,7 +63,7 @@ class Move:
         """Return F P, the rows of a matrix (N, M) moved on."""
         n = len(self.F)
         moved = P.copy()
-        moved[1:] = (self.F @ P[1:].reshape(n, BLOCK, -1)).reshape(n * BLOCK, -1)
+        moved[COMMON:] = (self.F @ P[COMMON:].reshape(n, BLOCK, -1)).reshape(n * BLOCK, -1)
         if self.anchor is None or self.anchor_p_m is None or self.anchor_v_mps is None:
             return moved
         # p' = p - p_ref in errors: dp' = dp - dp_ref - [p_ref]x (phi - phi_ref); v likewise.
@@ -81,16 +83,16 @@ class Move:
             return whole
         n = len(self.F)
         moved = M.copy()
-        moved[1:] = (self.F.swapaxes(1, 2) @ M[1:].reshape(n, BLOCK, -1)).reshape(n * BLOCK, -1)
+        moved[COMMON:] = (self.F.swapaxes(1, 2) @ M[COMMON:].reshape(n, BLOCK, -1)).reshape(n * BLOCK, -1)
         return moved
 
     def covariance(self, P: Floats) -> Floats:
         """Return F P F^T + Q."""
         n = len(self.F)
         after = P.copy()
-        after[1:] = (self.F @ P[1:].reshape(n, BLOCK, -1)).reshape(n * BLOCK, -1)
-        after[:, 1:] = (
-            (np.swapaxes(after[:, 1:].reshape(-1, n, BLOCK), 0, 1) @ self.F.swapaxes(1, 2))
+        after[COMMON:] = (self.F @ P[COMMON:].reshape(n, BLOCK, -1)).reshape(n * BLOCK, -1)
+        after[:, COMMON:] = (
+            (np.swapaxes(after[:, COMMON:].reshape(-1, n, BLOCK), 0, 1) @ self.F.swapaxes(1, 2))
             .swapaxes(0, 1)
             .reshape(-1, n * BLOCK)
         )
@@ -100,7 +102,7 @@ class Move:
             still = replace(self, F=np.broadcast_to(np.eye(BLOCK), self.F.shape))
             after = still.onward(still.onward(after).T)
             # The frame sinks and rises with the anchor: only differences of depth tell.
-            after[0, 0] += DATUM_STEP_M**2
+            after[DATUM, DATUM] += DATUM_STEP_M**2
         symmetric: Floats = 0.5 * (after + after.T)
         return symmetric
 

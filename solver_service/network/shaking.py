@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
-from buddyline.solver_service.network.state import MOVING, P_, PHI, SHAKE, SHOVE, V_
+from buddyline.solver_service.network.state import COMMON, MOVING, P_, PHI, SHAKE, SHOVE, V_
 from buddyline.solver_service.track.shaking import (
     FIRST_LOGS,
     LEAST,
@@ -79,7 +79,7 @@ class NetShaking:
         poorly known, but together, it could grow without an end. It is kept within S: tr(S^-1 D) <= rank D.
         """
         n, m = len(self.logs), len(y)
-        H_own = np.swapaxes(H[:, 1:].reshape(m, n, -1), 0, 1)[:, :, :MOVING]
+        H_own = np.swapaxes(H[:, COMMON:].reshape(m, n, -1), 0, 1)[:, :, :MOVING]
         D = (H_own[:, None] @ self.parts @ H_own.swapaxes(1, 2)[:, None]).reshape(2 * n, m, m)
         W = S_inverse @ D
         rank = np.repeat(np.clip(H_own.any(axis=2).sum(axis=1), 1, MOVING), 2)
@@ -92,7 +92,7 @@ class NetShaking:
         fisher = 0.5 * (W.reshape(2 * n, -1) @ W.swapaxes(1, 2).reshape(2 * n, -1).T)
         kept, first = 0.5 ** (1.0 / (HALVED * n)), np.tile(_FIRST, n)
         logs, information = learned(self.logs.ravel(), self.information, slope, fisher, first, kept)
-        rest = (np.eye(MOVING) - gain[1:].reshape(n, -1, m)[:, :MOVING] @ H_own)[:, None]
+        rest = (np.eye(MOVING) - gain[COMMON:].reshape(n, -1, m)[:, :MOVING] @ H_own)[:, None]
         parts = rest @ own @ rest.swapaxes(-1, -2)
         return NetShaking(np.clip(logs.reshape(n, 2), *_BOUNDS), information, parts)
 

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, Indices, skew
-from buddyline.solver_service.network.state import BLOCK, CLOCK, P_, PHI, V_, NetState
+from buddyline.solver_service.network.state import BLOCK, CLOCK, COMMON, P_, PHI, V_, NetState
 from buddyline.solver_service.track.lights import Sight, turns_over
 
 # The errors of the observer, then of the other node, that move a light: of each place, velocity, attitude and clock.
@@ -18,7 +18,7 @@ WIDTH: Final = 2 * len(OF_NODE)
 def columns(observers: Sequence[int], others: Sequence[int]) -> Indices:
     """Give the indices (B, WIDTH) in the whole error of what moves the others' lights in the observers' pictures."""
     of_both = np.stack((observers, others), axis=1)
-    indices: Indices = (1 + BLOCK * of_both[:, :, None] + OF_NODE).reshape(-1, WIDTH)
+    indices: Indices = (COMMON + BLOCK * of_both[:, :, None] + OF_NODE).reshape(-1, WIDTH)
     return indices
 
 

@@ -14,6 +14,7 @@ from buddyline.solver_service.track.start import (
     ACCEL_BIAS_MPS2,
     DELAY_TOLD_S,
     DELAY_UNTOLD_S,
+    DEPTH_SCALE_SIGMA,
     GYRO_BIAS_RADPS,
     LEVER_TOLD_M,
     LEVER_UNTOLD_M,
@@ -21,6 +22,11 @@ from buddyline.solver_service.track.start import (
     SPEED_MPS,
 )
 from buddyline.solver_service.track.state import orthonormal
+
+# The errors of all, before the nodes' own: of the frame's depth, and of the water's density.
+DATUM: Final = 0
+DEPTH_SCALE: Final = 1
+COMMON: Final = 2
 
 # The errors of one node, in the order of its block.
 P_: Final = slice(0, 3)
@@ -51,12 +57,13 @@ DATUM_M: Final = 1000.0
 
 @dataclass(frozen=True, eq=False)
 class NetState:
-    """Members (n) in the net's frame, z down. Error 0 is the datum's; the errors of node i are `block(i)`.
+    """Members (n) in the net's frame, z down. The errors of node i are `block(i)`.
 
     p_m, v_mps (n, 3): cameras. R (n, 3, 3): camera to net. shake_rad, shove_mps (n, 3): shaking, as in the track's
     State, each node's own. gyro_bias_radps, accel_bias_mps2, mount_rad, lever_m (n, 3), delay_s (n,): of the inertial
     units, camera axes. clock_s (n,): each clock minus the net's. gauge_m (n,): by how much each gauge reads too deep.
-    datum_m: depth of the frame's zero.
+    datum_m: depth of the frame's zero. depth_scale: by which share of what they show all gauges show too much: they are
+    told one density of the water.
     """
 
     p_m: Floats
@@ -72,18 +79,19 @@ class NetState:
     clock_s: Floats
     gauge_m: Floats
     datum_m: float
+    depth_scale: float
 
     def __len__(self) -> int:
         """Return the number of members."""
         return len(self.p_m)
 
     def plus(self, error: Floats) -> NetState:
-        """Return the state that is off this one by an error (1 + 30 n,).
+        """Return the state that is off this one by an error (2 + 30 n,).
 
         R = exp(phi) R^, p = exp(phi) p^ + dp, v and shove likewise, each with its node's own phi: turning all about
         the vertical is then an error in the phi alone, wherever the nodes are (docs/track.md, consistency).
         """
-        e = error[1:].reshape(len(self), BLOCK)
+        e = error[COMMON:].reshape(len(self), BLOCK)
         turn = rotation_exp(e[:, PHI])
         return NetState(
             p_m=_turned(turn, self.p_m) + e[:, P_],
@@ -98,11 +106,12 @@ class NetState:
             delay_s=self.delay_s + e[:, DELAY],
             clock_s=self.clock_s + e[:, CLOCK],
             gauge_m=self.gauge_m + e[:, GAUGE],
-            datum_m=self.datum_m + float(error[0]),
+            datum_m=self.datum_m + float(error[DATUM]),
+            depth_scale=self.depth_scale + float(error[DEPTH_SCALE]),
         )
 
     def minus(self, other: NetState) -> Floats:
-        """Return the error (1 + 30 n,) by which this state is off another: other.plus(error) is this one."""
+        """Return the error (2 + 30 n,) by which this state is off another: other.plus(error) is this one."""
         e = np.empty((len(self), BLOCK))
         e[:, PHI] = phi = rotation_log(self.R @ other.R.swapaxes(1, 2))
         turn = rotation_exp(phi)
@@ -117,7 +126,7 @@ class NetState:
         e[:, DELAY] = self.delay_s - other.delay_s
         e[:, CLOCK] = self.clock_s - other.clock_s
         e[:, GAUGE] = self.gauge_m - other.gauge_m
-        return np.concatenate(((self.datum_m - other.datum_m,), e.ravel()))
+        return np.concatenate(((self.datum_m - other.datum_m, self.depth_scale - other.depth_scale), e.ravel()))
 
     def chosen(self, members: list[int]) -> NetState:
         """Return the state of some members, in the order given."""
@@ -136,12 +145,12 @@ class NetState:
 
     @classmethod
     def behind(cls, states: Sequence[NetState]) -> NetState:
-        """Return the members of several states, one behind another, with the datum of the first."""
+        """Return the members of several states, one behind another, with what is common as it is in the first."""
         every = {name: np.concatenate([getattr(state, name) for state in states]) for name in _OF_NODES}
         return replace(states[0], **every)  # type: ignore[arg-type]
 
 
-_OF_NODES: Final = tuple(field.name for field in fields(NetState) if field.name != "datum_m")
+_OF_NODES: Final = tuple(field.name for field in fields(NetState) if field.name not in ("datum_m", "depth_scale"))
 
 
 _MOVED: Final = ("p_m", "v_mps", "R", "shake_rad", "shove_mps")
@@ -152,14 +161,20 @@ def _turned(turn: Floats, vectors: Floats) -> Floats:
     return turned
 
 
+def common_variances() -> Floats:
+    """Give the variances (COMMON,) of what is common to all, before anything is known."""
+    return np.square((DATUM_M, DEPTH_SCALE_SIGMA))
+
+
 def block(member: int) -> slice:
     """Give where a member's errors are."""
-    return slice(1 + BLOCK * member, 1 + BLOCK * (member + 1))
+    return slice(COMMON + BLOCK * member, COMMON + BLOCK * (member + 1))
 
 
 def blocks(members: list[int]) -> list[int]:
-    """Give the indices of the datum and of some members' errors."""
-    return [0] + [index for member in members for index in range(block(member).start, block(member).stop)]
+    """Give the indices of what is common and of some members' errors."""
+    of_members = np.arange(BLOCK) + COMMON + BLOCK * np.array(members, dtype=int)[:, None]
+    return [*range(COMMON), *of_members.ravel().tolist()]
 
 
 def own_of_plain(p_m: Floats, v_mps: Floats, shove_mps: Floats) -> Floats:
@@ -198,6 +213,7 @@ def lone(node: TrackNode, p_m: Floats, R: Floats) -> tuple[NetState, Floats]:
         clock_s=np.zeros(1),
         gauge_m=np.zeros(1),
         datum_m=0.0,
+        depth_scale=0.0,
     )
     sigma = np.zeros(BLOCK)
     sigma[V_] = SPEED_MPS

@@ -18,6 +18,11 @@ from buddyline.solver_service.network.state import (
     ACCEL_BIAS,
     BLOCK,
     CLOCK,
+    COMMON,
+    DATUM,
+    DEPTH_SCALE,
+    GAUGE,
+    GAUGE_M,
     GYRO_BIAS,
     LEVER,
     MOUNT,
@@ -29,8 +34,9 @@ from buddyline.solver_service.network.state import (
     V_,
     NetState,
     block,
+    common_variances,
 )
-from buddyline.solver_service.track.inputs import TrackNode
+from buddyline.solver_service.track.inputs import DepthSeen, TrackNode
 from buddyline.solver_service.track.intake import TrackIntake
 from buddyline.solver_service.track.lights import Sight
 from buddyline.solver_service.track.strapdown import Noise, SampleGrid, integrate
@@ -59,6 +65,7 @@ def a_state(seed: int, n: int = 3) -> NetState:
         clock_s=rng.normal(0.0, 0.003, n),
         gauge_m=rng.normal(0.0, 0.1, n),
         datum_m=2.0,
+        depth_scale=0.01,
     )
 
 
@@ -74,7 +81,7 @@ def differences(function: Callable[[Floats], Floats], size: int) -> Floats:
 
 def test_plus_and_minus_are_inverse() -> None:
     state, rng = a_state(1), np.random.default_rng(2)
-    error = rng.normal(0.0, 0.1, 1 + 3 * BLOCK)
+    error = rng.normal(0.0, 0.1, COMMON + 3 * BLOCK)
     assert state.plus(error).minus(state) == pytest.approx(error, abs=1e-9)
 
 
@@ -84,13 +91,13 @@ def test_lights(pair: tuple[int, int]) -> None:
     state, rates = a_state(3), np.random.default_rng(4).normal(0.0, 0.3, (3, 3))
     dt_s = np.array((-0.004, 0.006))
     D = light_positions(state, [observer], [other], LIGHTS_M[None], rates, dt_s[None])[1][0]
-    whole = np.zeros((*D.shape[:3], 1 + 3 * BLOCK))
+    whole = np.zeros((*D.shape[:3], COMMON + 3 * BLOCK))
     whole[..., columns([observer], [other])[0]] = D[..., :-1]
 
     def seen(error: Floats) -> Floats:
         return light_positions(state.plus(error), [observer], [other], LIGHTS_M[None], rates, dt_s[None])[0][0]
 
-    assert whole == pytest.approx(differences(seen, 1 + 3 * BLOCK), abs=1e-6)
+    assert whole == pytest.approx(differences(seen, COMMON + 3 * BLOCK), abs=1e-6)
     before, after = (
         light_positions(state, [observer], [other], LIGHTS_M[None], rates, dt_s[None] + step)[0][0]
         for step in (-1e-4, 1e-4)
@@ -112,7 +119,7 @@ def test_a_step() -> None:
     state, member, span_s = a_state(5), 1, 0.1
 
     def after(error: Floats) -> NetState:
-        whole = np.zeros(1 + 3 * BLOCK)
+        whole = np.zeros(COMMON + 3 * BLOCK)
         whole[block(member)] = error
         moved = state.plus(whole)
         grid, values, slow = samples(moved, member, 0.0)
@@ -143,7 +150,7 @@ def test_a_frame_that_moves_with_a_node() -> None:
 
     still = np.broadcast_to(np.eye(BLOCK), (3, BLOCK, BLOCK))
     move = Move(still, np.zeros((3, BLOCK, BLOCK)), 1, state.p_m[1], state.v_mps[1])
-    N = 1 + 3 * BLOCK
+    N = COMMON + 3 * BLOCK
     numeric = differences(lambda error: anchored(state.plus(error)).minus(anchored(state)), N)
     assert move.onward(np.eye(N)) == pytest.approx(numeric, abs=1e-6)
 
@@ -171,7 +178,7 @@ def an_estimate(state: NetState) -> NetEstimate:
     estimate = NetEstimate(intake)
     estimate.members = [Member(i, 0.0, confirmed=True, light_s=0.0) for i in range(3)]
     estimate.state, estimate.t_s = state, 0.0
-    estimate.covariance = np.eye(1 + 3 * BLOCK)
+    estimate.covariance = np.eye(COMMON + 3 * BLOCK)
     estimate.rates_radps = np.zeros((3, 3))
     return estimate
 
@@ -203,6 +210,53 @@ def test_lights_of_one_picture_share_the_error_of_its_stamp_whosever_they_are(mo
     assert rows[4:, which[2]] == pytest.approx(H[2, 0, 0, :, :-1])
 
 
+def test_gauges(monkeypatch: pytest.MonkeyPatch) -> None:
+    port_m, age_s = np.array((0.1, -0.2, 0.3)), 0.2
+    rig = Rig(PINHOLE, LIGHTS_M, depth_port_m=port_m)
+    estimate = an_estimate(a_state(12))
+    estimate.intake.nodes = [TrackNode(name, rig) for name in "abc"]
+    applied: list[tuple[Floats, Floats]] = []
+    monkeypatch.setattr(NetEstimate, "_apply", lambda _, H, y, __: applied.append((H, y)))
+    seen = [(member, age_s, DepthSeen(0, 2.0 + member, 0.02)) for member in range(3)]
+
+    def residuals(error: Floats) -> Floats:
+        estimate.state = a_state(12).plus(error)
+        estimate._take_gauges(seen)
+        return applied[-1][1]
+
+    numeric = differences(residuals, COMMON + 3 * BLOCK)
+    estimate.state = a_state(12)
+    estimate._take_gauges(seen)
+    assert applied[-1][0] == pytest.approx(-numeric, abs=1e-6)
+
+
+def test_gauges_that_take_the_sea_for_fresh_water_do_not_move_a_network() -> None:
+    """Node 0 stands 12 m deep, and is known to. Node 1 rises 10 m above it, which lights show to 5 cm. Both gauges show
+    2.8 % too much, and that of node 1 0.1 m more."""
+    estimate = an_estimate(a_state(13))
+    P = np.diag(np.concatenate((common_variances(), np.zeros(3 * BLOCK))))
+    for gauge in (block(member).start + GAUGE for member in (0, 1)):
+        P[gauge, gauge] = GAUGE_M**2
+    place = slice(block(1).start + P_.start, block(1).start + P_.stop)
+    port = estimate.nodes[0].rig.depth_port_m
+    for height_m in np.linspace(0.0, 10.0, 41).tolist():
+        assert estimate.state is not None
+        p_m = np.array(((0.0, 0.0, 0.0), (3.0, 0.0, -height_m), (0.0, 0.0, 0.0)))
+        estimate.state = state = replace(estimate.state, p_m=p_m)
+        P[place] = P[:, place] = 0.0
+        P[place, place] = 0.05**2 * np.eye(3)
+        estimate.covariance = P
+        ports_m = [float((state.R[member] @ port)[2]) for member in (0, 1)]
+        shown_m = 1.028 * (12.0 + ports_m[0]), 1.028 * (12.0 - height_m + ports_m[1]) + 0.1
+        for member in (0, 1):
+            estimate._take_gauges([(member, 0.0, DepthSeen(0, shown_m[member], 0.02))])
+        P = estimate.covariance
+        assert abs(estimate.state.p_m[1, 2] + height_m) < 3.0 * np.sqrt(P[place, place][2, 2])
+    known = {"depth_scale": (0.028 / 1.028, DEPTH_SCALE, 0.02), "datum_m": (12.0, DATUM, 0.3)}
+    for name, (true, error, most) in known.items():
+        assert abs(getattr(estimate.state, name) - true) < 3.0 * np.sqrt(P[error, error]) < most, name
+
+
 def relative(state: NetState) -> tuple[Floats, Floats]:
     """Where member 2 is from member 1."""
     return state.R[1].T @ (state.p_m[2] - state.p_m[1]), state.R[1].T @ state.R[2]
@@ -219,7 +273,7 @@ def test_the_gap_of_a_pose_counts_both_nodes_errors() -> None:
         t_now, R_now = relative(state.plus(error))
         return np.concatenate((t_now - t, rotation_log(R_now @ R.T)))
 
-    H = differences(seen, 1 + 3 * BLOCK)
+    H = differences(seen, COMMON + 3 * BLOCK)
     S = H @ H.T + 1e-6 * np.eye(6) + np.diag([1e-4] * 3 + [1e-5] * 3)
     assert chi2 == pytest.approx(gap @ np.linalg.solve(S, gap), rel=1e-6)
 
@@ -242,7 +296,7 @@ def test_a_pose_the_other_way_round_has_the_same_covariance() -> None:
 def test_a_node_that_joins_has_the_errors_of_who_sees_it() -> None:
     state = a_state(9)
     estimate = an_estimate(state)
-    root = np.random.default_rng(10).normal(0.0, 0.3, (1 + 3 * BLOCK, 1 + 3 * BLOCK))
+    root = np.random.default_rng(10).normal(0.0, 0.3, (COMMON + 3 * BLOCK, COMMON + 3 * BLOCK))
     estimate.covariance = P = 1e-4 * root @ root.T
     t, R = relative(state)
     estimate.intake.nodes = [*estimate.intake.nodes, TrackNode("d", Rig(PINHOLE, LIGHTS_M))]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from buddyline.solver_service.network.shaking import NetShaking, shaking_parts
-from buddyline.solver_service.network.state import BLOCK, MOVING, P_
+from buddyline.solver_service.network.state import BLOCK, COMMON, MOVING, P_
 
 
 @pytest.mark.parametrize("others", [0, 6])
@@ -14,8 +14,8 @@ def test_places_known_together_only_do_not_let_a_members_part_grow_without_an_en
     for _ in range(n):
         shaking = shaking.joined()
     drawn, still = shaking_parts(np.eye(3)[None].repeat(n, 0), np.full(n, 0.1)), np.eye(MOVING)[None].repeat(n, 0)
-    places = [slice(1 + BLOCK * k + P_.start, 1 + BLOCK * k + P_.stop) for k in range(n)]
-    P, H = 1e-6 * np.eye(1 + n * BLOCK), np.zeros((3 + 3 * others, 1 + n * BLOCK))
+    places = [slice(COMMON + BLOCK * k + P_.start, COMMON + BLOCK * k + P_.stop) for k in range(n)]
+    P, H = 1e-6 * np.eye(COMMON + n * BLOCK), np.zeros((3 + 3 * others, COMMON + n * BLOCK))
     one, other = places[:2]
     for at, beside, variance in ((one, one, 1.0), (other, other, 0.5), (one, other, 0.7), (other, one, 0.7)):
         P[at, beside] = variance * np.eye(3)

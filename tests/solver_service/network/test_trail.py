@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.network.motion import Move
-from buddyline.solver_service.network.state import BLOCK, NetState, block, blocks, lone
+from buddyline.solver_service.network.state import BLOCK, COMMON, NetState, block, blocks, lone
 from buddyline.solver_service.network.trail import Chosen, Grown, Learned, NetTrail, Present, Told
 from buddyline.solver_service.track.inputs import TrackNode
 
@@ -28,7 +28,7 @@ class RandomCourse:
     def __init__(self, seed: int, anchor: int | None) -> None:
         self.rng = np.random.default_rng(seed)
         self.trail, self.anchor = NetTrail(), anchor
-        self.n, N = 2, 1 + 2 * BLOCK
+        self.n, N = 2, COMMON + 2 * BLOCK
         root = self.rng.normal(0.0, 0.02, (N, N))
         self.state = still().joined(still())
         # By the filter.
