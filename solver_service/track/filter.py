@@ -278,10 +278,10 @@ class TrackFilter(TrackPool):
 
     def _compared_with(self, estimate: Estimate, t_s: float, fix: FixSeen) -> tuple[float, bool]:
         """Give chi^2 (of 6) of a fix against an estimate, and whether the estimate is an unconfirmed, wide start."""
-        state, P = self._predict(estimate, t_s)
+        state, P, rates_radps = self._predict(estimate, t_s)
         place, of_fix = place_covariance(state, P), fix.covariance[:3, :3]
         wide = not estimate.confirmed and float(place.trace()) > WIDER**2 * float(of_fix.trace())
-        return fix_chi2(state, P[BLOCK], estimate.rates_radps, fix), wide
+        return fix_chi2(state, P[BLOCK], rates_radps, fix), wide
 
     @staticmethod
     def _used_none(estimate: Estimate) -> bool:
@@ -436,4 +436,4 @@ class TrackFilter(TrackPool):
             self._step(main, main.t_s + TICK_S, None)
         row = self._present(main, t_s)
         self._last_row = main, row
-        return DueRow(stamp_ns, row, main.rates_radps, main.status)
+        return DueRow(stamp_ns, row, main.status)

@@ -143,11 +143,11 @@ def _block_after(P: Floats, F: Floats, Q: Floats, walk: Floats) -> Floats:
 class DueRow:
     """A row that is to be told, and what it is made of: the track at its time, and how its lights were.
 
-    rates_radps (2, 3), status: of the track's last step.
+    status: of the track's last step.
     """
 
-    def __init__(self, stamp_ns: int, forecast: Forecast, rates_radps: Floats, status: EstimateStatus) -> None:
-        self.stamp_ns, self.forecast, self.rates_radps, self.status = stamp_ns, forecast, rates_radps, status
+    def __init__(self, stamp_ns: int, forecast: Forecast, status: EstimateStatus) -> None:
+        self.stamp_ns, self.forecast, self.status = stamp_ns, forecast, status
         self._rows: list[TrackRow | None] = []
 
     @property
@@ -180,7 +180,7 @@ def make_rows(due: Iterable[DueRow]) -> None:
             [one.forecast.t_s for one in every],
             State(np.array([each.row for each in now])),
             np.array([each.covariance for each in now]),
-            np.array([one.rates_radps for one in every]),
+            np.array([each.rates_radps for each in now]),
             [one.status for one in every],
         )
         for one, row in zip(some, rows, strict=True):

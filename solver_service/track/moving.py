@@ -292,15 +292,15 @@ class TrackMoves(TrackIntake):
         rate, estimate.turning_off[node] = sudden_rate(y, S, estimate.turning_off[node], span_s)
         return noise._replace(gap_rate_radps=max(noise.gap_rate_radps, rate))
 
-    def _predict(self, estimate: Estimate, t_s: float) -> tuple[State, Floats]:
-        """Return state and covariance at t_s, within TOGETHER_S those of now."""
+    def _predict(self, estimate: Estimate, t_s: float) -> tuple[State, Floats, Floats]:
+        """Return state, covariance and turn rates (2, 3) at t_s, within TOGETHER_S those of now."""
         span_s = t_s - estimate.t_s
         if span_s <= TOGETHER_S:
-            return estimate.state, estimate.covariance
+            return estimate.state, estimate.covariance, estimate.rates_radps
         parts = self.increments(estimate, t_s)
         noises = self._noises(estimate, t_s)
         shares = kept_shares(parts.without, noises, span_s) * (parts.without == estimate.without)
         after, F = propagate(estimate.state, parts, span_s, shares)
         shaking = self._with_sudden(estimate.shaking.variances, parts.sudden_rad)
         Q, walk, _ = process_noise(after, parts, noises, shaking, span_s, shares)
-        return after, predicted(estimate.covariance, F, Q, walk)
+        return after, predicted(estimate.covariance, F, Q, walk), parts.rate_radps
