@@ -16,7 +16,7 @@ from buddyline.solver_service.track.forecasts import TOGETHER, DueRow, Forecast,
 from buddyline.solver_service.track.inputs import AttitudeSeen, FixSeen, TrackNode
 from buddyline.solver_service.track.intake import newest_before
 from buddyline.solver_service.track.lights import BLOCK, COLUMNS, Sight
-from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S, excerpt
+from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S, excerpt, to_other_clocks
 from buddyline.solver_service.track.output import CONTRADICTS, TrackRow, fix_chi2, fix_residual
 from buddyline.solver_service.track.pool import MAX_TENTATIVE, TrackPool
 from buddyline.solver_service.track.scale import MOST_GAP, gap_words, with_gap
@@ -158,8 +158,10 @@ class TrackFilter(TrackPool):
         if t_s <= from_s:
             return of_state(from_s, state, P, estimate.rates_radps)
         a, b = (
-            excerpt(samples, delay_s, from_s, t_s)
-            for samples, delay_s in zip(self.samples, state.delay_s.tolist(), strict=True)
+            excerpt(samples, delay_s, from_s, t_s, carried_s)
+            for samples, delay_s, carried_s in zip(
+                self.samples, state.delay_s.tolist(), to_other_clocks(state), strict=True
+            )
         )
         noises, span_s = self._noises(estimate, t_s), t_s - from_s
         without = np.array((a.without, b.without))
@@ -308,7 +310,9 @@ class TrackFilter(TrackPool):
     def _start(self, t_s: float, fix: FixSeen) -> Estimate | None:
         attitudes = [newest_before(of_node, t_s + HOLD_S) for of_node in self.attitudes]
         force = self.samples[0].between(t_s - 0.5, t_s, t_s)[1][:, :3].mean(0) if len(self.samples[0]) else None
-        made = state_from_fix(self.nodes, fix, attitudes[0][1] if attitudes[0] else None, force, self.clock_sigma_s)
+        rates = [samples.slow_rate(t_s, t_s + HOLD_S) for samples in self.samples]
+        seen = attitudes[0][1] if attitudes[0] else None
+        made = state_from_fix(self.nodes, fix, seen, force, rates, self.clock_sigma_s)
         if made is None:
             return None
         state, covariance = made

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 
 import numpy as np
-from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
 from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.guessing import GuessedMotion
@@ -49,6 +49,8 @@ TOGETHER_S: Final = 0.005
 # The clocks' offset is believed where it is known better than this, 1 sd. Only then is learned how much the biases
 # walk: an unknown offset looks like a walk.
 KNOWN_CLOCK_S: Final = 0.008
+# Carried on for less than this, a node turns as it does now.
+LITTLE_CARRIED_S: Final = 0.003
 MAX_DELAY_S: Final = 0.03
 # How fast a node without an inertial unit turns, and how far off its attitude may be, 1 sd.
 WITHOUT_RADPS: Final = 0.25
@@ -71,7 +73,8 @@ Number = TypeVar("Number", np.float64, np.bool_)
 class Excerpt:
     """One node's samples between two times: times_s (M,), values (M, 13), told (M - 1,), slow_radps (2, 3).
 
-    As in SampleGrid. without: whether there is no unit at all.
+    As in SampleGrid. without: whether there is no unit at all. faster_radps (3,): by how much faster it turns, on mean,
+    while it is carried on from the end to the other node's clock.
     """
 
     times_s: Floats
@@ -79,10 +82,11 @@ class Excerpt:
     told: Bools
     slow_radps: Floats
     without: bool
+    faster_radps: Floats
 
 
-def excerpt(samples: Samples, delay_s: float, from_s: float, to_s: float) -> Excerpt:
-    """Give a node's samples from one time to the next, by its own clock's delay."""
+def excerpt(samples: Samples, delay_s: float, from_s: float, to_s: float, carried_s: float = 0.0) -> Excerpt:
+    """Give a node's samples from one time to the next, by its own clock's delay; it is carried on by carried_s."""
     known_s = to_s + HOLD_S
     shift = min(max(delay_s, -MAX_DELAY_S), MAX_DELAY_S)
     times_s, values, told = samples.between(from_s + shift, to_s + shift, known_s)
@@ -94,7 +98,21 @@ def excerpt(samples: Samples, delay_s: float, from_s: float, to_s: float) -> Exc
         rate = samples.slow_rate(each_s, known_s)
         if rate is not None:
             slow[end] = rate
-    return Excerpt(times_s, values, told, slow, without)
+    faster = np.zeros(3) if without else _faster(samples, to_s + shift, known_s, carried_s, values[-1, 3:6])
+    return Excerpt(times_s, values, told, slow, without, faster)
+
+
+def _faster(samples: Samples, at_s: float, known_s: float, carried_s: float, rate_radps: Floats) -> Floats:
+    """Give the mean turn rate (3,) while a node is carried on from at_s, over that at at_s.
+
+    Lights are carried over all of the clocks' offset, rows over half of it: the mean is over two thirds.
+    """
+    if abs(carried_s) < LITTLE_CARRIED_S:
+        return np.zeros(3)
+    first_s, last_s = sorted((at_s, min(at_s + 2.0 / 3.0 * carried_s, known_s)))
+    times_s, values, _ = samples.between(first_s, last_s, known_s)
+    steps = (times_s[1:] - times_s[:-1]) / (times_s[-1] - times_s[0])
+    return np.asarray(0.5 * steps @ (values[1:, 3:6] + values[:-1, 3:6]) - rate_radps)
 
 
 def integrated(state: Carried, of_nodes: Sequence[Excerpt], *, by_shares: bool = False) -> Increments:
@@ -108,21 +126,39 @@ def integrated(state: Carried, of_nodes: Sequence[Excerpt], *, by_shares: bool =
         every[..., 6:12] if by_shares else None,
     )
     without = np.array([one.without for one in of_nodes])
-    return replace(integrate(state, grid), without=without, sudden_rad=every[..., 12].max(axis=1))
+    parts = integrate(state, grid)
+    faster = (rotation_exp(-state.mount_rad) @ np.array([one.faster_radps for one in of_nodes])[..., None])[..., 0]
+    rates = parts.rate_radps + faster
+    return replace(parts, rate_radps=rates, without=without, sudden_rad=every[..., 12].max(axis=1))
 
 
 def increments(
-    of_nodes: Sequence[Samples], state: Carried, from_s: float, to_s: float, *, by_shares: bool = False
+    of_nodes: Sequence[Samples],
+    state: Carried,
+    from_s: float,
+    to_s: float,
+    *,
+    carried_s: Sequence[float] | None = None,
+    by_shares: bool = False,
 ) -> Increments:
     """Integrate the samples of a state's nodes from one time to the next, each by its own clock's delay.
 
-    by_shares: whether to tell what shares of the samples' fast parts do.
+    carried_s: by how much each is carried on from there. by_shares: whether to tell what shares of the samples' fast
+    parts do.
     """
     found = [
-        excerpt(samples, delay_s, from_s, to_s)
-        for samples, delay_s in zip(of_nodes, state.delay_s.tolist(), strict=True)
+        excerpt(samples, delay_s, from_s, to_s, carried)
+        for samples, delay_s, carried in zip(
+            of_nodes, state.delay_s.tolist(), carried_s or [0.0] * len(of_nodes), strict=True
+        )
     ]
     return integrated(state, found, by_shares=by_shares and any(samples.parted for samples in of_nodes))
+
+
+def to_other_clocks(state: State) -> tuple[float, float]:
+    """Give by how much A and B are carried on to the times at which the other's pictures show them."""
+    offset_s = float(state.clock_s)
+    return -offset_s, offset_s
 
 
 def sudden_rate(y: Floats, S: Floats, turning_off: Floats, span_s: float) -> tuple[float, Floats]:
@@ -160,7 +196,10 @@ class TrackMoves(TrackIntake):
 
     def increments(self, estimate: Estimate, t_s: float) -> Increments:
         """Integrate both nodes from the estimate's time to t_s."""
-        return increments(self.samples, estimate.state, estimate.t_s, t_s, by_shares=estimate.learns)
+        carried_s = to_other_clocks(estimate.state)
+        return increments(
+            self.samples, estimate.state, estimate.t_s, t_s, carried_s=carried_s, by_shares=estimate.learns
+        )
 
     def _with_sudden(self, variances: Floats, sudden_rad: Floats) -> Floats:
         """Give the variances (3,) of shaking with what the shares take off a camera's own sudden turns."""

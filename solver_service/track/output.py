@@ -89,10 +89,37 @@ def pose_jacobian(now: State) -> Floats:
     return J
 
 
+def as_a_fix_sees_it(state: State, rates_radps: Floats) -> tuple[State, Floats]:
+    """Give the state of which a fix tells t and R_a_b, and its errors (NAV, C) by the state's errors of COLUMNS.
+
+    A fix takes both pictures for one instant's. With the clocks c apart, B's direction is as A sees it, r + c v, and
+    A's as B sees it, r; the range, and the turn about the line of sight e, which both pictures tell, are midway:
+    r' = r + c (v - e (e . v) / 2),  R_B' = exp(c (e x v / |r| + e (e . (R_A w_A + R_B w_B)) / 2)) R_B
+    To first order of c; how e changes by the errors is of the second.
+    """
+    c, r, v = float(state.clock_s), state.r_m, state.v_mps
+    range_m = float(state.range_m)
+    e = r / range_m
+    half_along = 0.5 * np.outer(e, e)
+    moved = np.eye(3) - half_along
+    swept = skew(e) / range_m
+    r_per_s, turn_per_s = moved @ v, swept @ v + half_along @ (state.R @ rates_radps[..., None]).sum(axis=0)[:, 0]
+    seen = state.moved(r + c * r_per_s, v, np.stack((state.R[0], rotation_exp(c * turn_per_s) @ state.R[1])))
+    J = np.zeros((NAV, len(COLUMNS)))
+    J[range(NAV), range(NAV)] = 1.0
+    # The errors are those of plus: r turns with phi_B, v with phi_A.
+    across = skew(seen.r_m)
+    J[R_, V_] = c * (moved + across @ swept)
+    J[R_, PHI[0]], J[R_, PHI[1]] = -c * moved @ skew(v), c * skew(r_per_s)
+    J[R_, NAV] = r_per_s + across @ turn_per_s
+    J[PHI[1], V_], J[PHI[1], NAV] = c * swept, turn_per_s
+    return seen, J
+
+
 def fix_residual(state: State, rates_radps: Floats, fix: FixSeen) -> tuple[Floats, Floats, Floats]:
     """Give by what (6,) a fix differs from a state, its Jacobian (6, C) by COLUMNS, and the fix's noise (6, 6)."""
-    now = at_one_time(state, rates_radps)
-    J = (pose_jacobian(now) @ at_one_time_jacobian(state, rates_radps))[:6]
+    now, by_state = as_a_fix_sees_it(state, rates_radps)
+    J = (pose_jacobian(now) @ by_state)[:6]
     toward = now.R[0].T
     gap = np.concatenate((fix.t_a_b_m - toward @ now.r_m, rotation_log(fix.R_a_b @ (toward @ now.R[1]).T)))
     return gap, J, fix.covariance + np.diag([1e-4] * 3 + [1e-5] * 3)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.geometry.rotation import Floats, skew
 from buddyline.solver_service.track.anchors import attitude_covariance
 from buddyline.solver_service.track.inputs import AttitudeSeen, FixSeen, TrackNode
 from buddyline.solver_service.track.shaking import SHAKE_RAD, SHOVE_MPS, Shaking
@@ -129,11 +130,14 @@ def state_from_fix(
     fix: FixSeen,
     attitude: AttitudeSeen | None,
     force_mps2: Floats | None,
+    rates_radps: Sequence[Floats | None],
     clock_sigma_s: float,
 ) -> tuple[State, Floats] | None:
     """Start from a fix, with A's attitude by its message or else its accelerometer; None where neither tells.
 
-    R_B = R_A R_a_b, r = R_A t: r errs by R_A dt, and phi_B = phi_A + R_A w.
+    R_B = R_A R_a_b, r = R_A t: r errs by R_A dt, and phi_B = phi_A + R_A w. Both err by what moves while the clocks are
+    apart, too (output.as_a_fix_sees_it). rates_radps (3,): the nodes' turn rates, None where a node has no inertial
+    unit: then nothing is added, for such a start would drift off by guessed motion.
     """
     if attitude is not None:
         R_A = attitude.R_ned_body @ nodes[0].rig.R_body_camera
@@ -152,4 +156,23 @@ def state_from_fix(
     enter_attitudes(P, level, from_fix[3:, 3:])
     P[R_, PHI[1]] = from_fix[:3, 3:]
     P[PHI[1], R_] = from_fix[3:, :3]
+    told = [R @ rate for R, rate in zip(state.R, rates_radps, strict=True) if rate is not None]
+    if len(told) == 2:
+        P += clock_sigma_s**2 * _by_unknown_clock(state, told[0] + told[1])
     return state, of_place(state, P)
+
+
+def _by_unknown_clock(state: State, turning_radps: Floats) -> Floats:
+    """Give the covariance (SIZE, SIZE) of a fix's plain errors by clocks 1 s apart (1 sd), and a velocity of SPEED_MPS.
+
+    By `output.as_a_fix_sees_it`. turning_radps (3,): the sum of both nodes' turn rates, level. Without the clock's own.
+    """
+    e = state.r_m / state.range_m
+    half_along = 0.5 * np.outer(e, e)
+    by_way = np.zeros((SIZE, 3))
+    by_way[R_], by_way[PHI[1]] = half_along - np.eye(3), -skew(e) / state.range_m
+    by_clock = np.zeros(SIZE)
+    by_clock[PHI[1]] = -half_along @ turning_radps
+    covariance: Floats = SPEED_MPS**2 * by_way @ by_way.T + np.outer(by_clock, by_clock)
+    covariance[CLOCK], covariance[:, CLOCK] = by_clock, by_clock
+    return covariance

@@ -106,6 +106,14 @@ class SwayingPair:
         return turned
 
 
+class RestlessPair(SwayingPair):
+    """They turn to and fro within one to three seconds."""
+
+    def __init__(self, rng: np.random.Generator, setting: Setting) -> None:
+        super().__init__(rng, setting)
+        self._turn = [SineSway(rng, 1.2, 3.0), SineSway(rng, 1.2, 3.0)]
+
+
 def make(seed: int, setting: Setting, motion: SwayingPair | None = None, lamps: Lamps | None = None) -> KnownDive:
     """Make a dive; lamps: of others than the two nodes."""
     rng = np.random.default_rng((seed, 17))
@@ -122,7 +130,11 @@ def make(seed: int, setting: Setting, motion: SwayingPair | None = None, lamps: 
         off = rotation_exp(rng.normal(0.0, np.radians(1.0), 3)) if setting.poor else np.eye(3)
         units.append((lever, off, rng.uniform(0.002, 0.006) if setting.poor else 0.0))
     triggers = np.arange(2, int(setting.seconds * setting.rate_hz)) / setting.rate_hz
-    frames = [_frames(rng, motion, nodes, node, triggers, setting, lamps) for node in (0, 1)]
+    # Each node takes its pictures when its own clock says so.
+    frames = [
+        _frames(rng, motion, nodes, node, triggers - clock_s, setting, lamps)
+        for node, clock_s in enumerate((0.0, setting.clock_s))
+    ]
     records = []
     for node in (0, 1):
         clock_s = setting.clock_s if node else 0.0

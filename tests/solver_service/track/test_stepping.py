@@ -110,7 +110,7 @@ def test_a_start_is_weighed_without_the_doubt_of_its_clock_and_moved_with_it(mon
 
 
 def test_a_walk_is_learned_only_once_the_clock_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    dive = make(1, Setting(seconds=8.0))
+    dive = make(1, Setting(seconds=12.0))
     track = filter_of(dive.records, dive.fixes)
     learned: list[Floats] = []
     taught = Walking.taught

@@ -24,9 +24,8 @@ from tests.solver_service.track.assignments import weigh
 from tests.solver_service.track.dives import (
     EPOCH_NS,
     KnownDive,
+    RestlessPair,
     Setting,
-    SineSway,
-    SwayingPair,
     bare_of,
     filter_of,
     fix_errors,
@@ -485,14 +484,6 @@ def test_a_lamp_behind_the_camera_is_no_candidates() -> None:
     assert all(of_first is None for of_first, _ in cases)
     assert len(cases) > 1
     assert np.isfinite(logs).all()
-
-
-class RestlessPair(SwayingPair):
-    """They turn to and fro within one to three seconds."""
-
-    def __init__(self, rng: np.random.Generator, setting: Setting) -> None:
-        super().__init__(rng, setting)
-        self._turn = [SineSway(rng, 1.2, 3.0), SineSway(rng, 1.2, 3.0)]
 
 
 def test_rows_between_pictures_are_carried_between_the_clocks_by_their_own_turn_rates() -> None:

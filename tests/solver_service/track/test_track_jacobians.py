@@ -7,10 +7,17 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from buddyline.solver_service.geometry.camera import Camera
-from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
+from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log
 from buddyline.solver_service.track.anchors import attitude_residual, depth_residual, kalman
 from buddyline.solver_service.track.lights import BLOCK, COLUMNS, light_positions, residuals
-from buddyline.solver_service.track.output import at_one_time, at_one_time_jacobian, pose_jacobian, rows_of
+from buddyline.solver_service.track.output import (
+    as_a_fix_sees_it,
+    at_one_time,
+    at_one_time_jacobian,
+    fix_chi2,
+    pose_jacobian,
+    rows_of,
+)
 from buddyline.solver_service.track.start import DEPTH_OFFSET_M, DEPTH_SCALE_SIGMA
 from buddyline.solver_service.track.state import (
     CLOCK,
@@ -32,6 +39,8 @@ from buddyline.solver_service.track.state import (
 from buddyline.solver_service.track.strapdown import Increments, SampleGrid, integrate, propagate
 from buddyline.solver_service.track.trail import EstimateStatus
 from numpy.typing import NDArray
+
+from tests.solver_service.track.dives import EPOCH_NS, RestlessPair, Setting, make
 
 STEP = 1e-6
 PINHOLE = Camera("pinhole", 820, 616, 900.0, 905.0, 409.5, 307.5, (-0.2, 0.05, 1e-3, -1e-3, 0.0))
@@ -264,6 +273,44 @@ def test_pose_covariance() -> None:
     whole = J @ P @ J.T
     assert np.allclose(covariance[:6, :6], whole[:6, :6], atol=3e-3)
     assert np.allclose(covariance[6:9, 6:9], whole[6:, 6:], atol=1e-6)
+
+
+def test_what_a_fix_sees_errs_as_its_state_does() -> None:
+    """To first order of the clocks' offset, by differences of what a fix would tell."""
+    state, rate = a_state(2).with_parts(clock_s=0.03), np.array(((0.3, -0.2, 0.4), (-0.1, 0.5, 0.2)))
+    seen, J = as_a_fix_sees_it(state, rate)
+    t0, R0 = seen.R[0].T @ seen.r_m, seen.R[0].T @ seen.R[1]
+
+    def fix(error: Floats) -> Floats:
+        moved, _ = as_a_fix_sees_it(state.plus(error), rate)
+        return np.concatenate((moved.R[0].T @ moved.r_m - t0, rotation_log(moved.R[0].T @ moved.R[1] @ R0.T)))
+
+    own = (pose_jacobian(seen) @ J)[:6]
+    numeric = differences(fix, np.array(COLUMNS))
+    assert np.abs(own[:, NAV]).max() > 0.3
+    assert own == pytest.approx(numeric, abs=0.02)
+
+
+@pytest.mark.parametrize("clock_s", [0.04, -0.06])
+def test_a_fix_of_clocks_apart_tells_what_each_picture_showed(clock_s: float) -> None:
+    """Taken for what is midway between both clocks, they had a mean chi^2 of 26 and 51, and contradicted true ones."""
+    chi2 = []
+    for seed in range(4):
+        setting = Setting(seconds=12.0, clock_s=clock_s)
+        motion = RestlessPair(np.random.default_rng(seed), setting)
+        dive = make(seed, setting, motion)
+        for fix in dive.fixes:
+            of_a = (fix.stamp_ns - EPOCH_NS) * 1e-9
+            # When A's picture was taken, and B's; shortly after each, for rates.
+            times = np.array((of_a, of_a - clock_s, of_a + 1e-4, of_a - clock_s + 1e-4))
+            R_a, R_b = motion.attitudes(0, times), motion.attitudes(1, times)
+            rates = 1e4 * np.array((rotation_log(R_a[0].T @ R_a[2]), rotation_log(R_b[1].T @ R_b[3])))
+            apart = motion.places(1, times) - motion.places(0, times)
+            state = State.at_rest(apart[1], np.stack((R_a[0], R_b[1]))).with_parts(clock_s=clock_s)
+            state = state.moved(apart[1], (apart[0] - apart[1]) / clock_s, state.R)
+            chi2.append(fix_chi2(state, np.zeros((NAV + 1, NAV + 1)), rates, fix))
+    assert len(chi2) > 100
+    assert np.mean(chi2) < 4.0
 
 
 def test_gauges_that_take_the_sea_for_fresh_water_do_not_move_a_track() -> None:
