@@ -164,7 +164,10 @@ class NetTracker:
         track = self._filter
         for fix in fixes:
             if fix.node_a in self._nodes and fix.node_b in self._nodes:
-                track.add_pair_fix(self._nodes.index(fix.node_a), self._nodes.index(fix.node_b), fix_of(fix))
+                a, b = self._nodes.index(fix.node_a), self._nodes.index(fix.node_b)
+                seen = ((a, fix.blobs_a), (b, fix.blobs_b))
+                candidates = [(node, k) for node, blobs in seen for k in blobs if k >= 0]
+                track.add_pair_fix(a, b, fix_of(fix), fix.trigger, candidates)
         if to_ns <= self._taken_ns:
             return self._with_left([])
         for index, node in enumerate(self._nodes):

@@ -79,7 +79,8 @@ class Member:
     """What is known of a member beside its state.
 
     light_s: time of the last light that was used of it, or in its pictures. skip_s: earlier lights are not used, for
-    they made it a member. evidence: log odds over clutter since it joined. without: it has no inertial unit now.
+    they made it a member. evidence (2,): log odds over clutter since it joined, of the others' pictures for its lights,
+    and of its own pictures for theirs. without: it has no inertial unit now.
     turning_off (3,), looks_away: as in the track's estimate, of its own turning and its own pictures. compass: its
     heading as its last attitude had it, minus the network's, rad, and the variance that it stated, rad^2.
     """
@@ -89,7 +90,7 @@ class Member:
     confirmed: bool
     light_s: float
     skip_s: float = -np.inf
-    evidence: float = 0.0
+    evidence: tuple[float, float] = (0.0, 0.0)
     attitude_s: float = -np.inf
     depth_s: float = -np.inf
     without: bool = False

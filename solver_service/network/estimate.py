@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from buddyline.protocol.blinking import lit
@@ -31,9 +31,11 @@ from buddyline.solver_service.track.stepping import TICK_S
 from buddyline.solver_service.track.visible import EDGE_PX
 from numpy.typing import NDArray
 
-# A node is confirmed once its lights explain the pictures better than clutter by this (log odds). It leaves below
-# GIVEN_UP, or when it has not been confirmed within PATIENCE_S.
+# A node is confirmed once its lights in the others' pictures and theirs in its own explain these better than clutter by
+# CONFIRMED (log odds) together, and each alone by EACH: a node that takes lights for another's sees, but is not seen.
+# It leaves when one of both is below GIVEN_UP, or when it has not been confirmed within PATIENCE_S.
 CONFIRMED: Final = 25.0
+EACH: Final = 7.0
 GIVEN_UP: Final = -15.0
 PATIENCE_S: Final = 4.0
 # Beyond this chi^2 a pose (6 degrees of freedom) or an attitude (3) contradicts the network.
@@ -53,13 +55,21 @@ IRON_RAD: Final = np.radians((1.0, 1.0, 8.0))
 SKIP_S: Final = 0.02
 _POSE: Final = np.r_[P_, PHI]
 
+Candidate: TypeAlias = tuple[int, int]
+"""A candidate of a trigger: the node, and its place in that node's picture."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PairFix(FixSeen):
-    """A pose of the node `other` from the node `node`, as indices of the network's nodes."""
+    """A pose of the node `other` from the node `node`, as indices of the network's nodes.
+
+    trigger: whose pictures it is of. candidates: what it takes for lamps.
+    """
 
     node: int = 0
     other: int = 0
+    trigger: int = 0
+    candidates: frozenset[Candidate] = frozenset()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -189,9 +199,11 @@ class NetEstimate(NetBelief):
             seen[ns] = shared.seen
             self.evidence += shared.total
             for n, gained in zip(ns, shared.evidence.tolist(), strict=True):
-                for one in (self.members[bars[n].other], self.members[bars[n].observer]):
-                    if not one.confirmed:
-                        one.evidence += gained
+                other, observer = self.members[bars[n].other], self.members[bars[n].observer]
+                if not other.confirmed:
+                    other.evidence = other.evidence[0] + gained, other.evidence[1]
+                if not observer.confirmed:
+                    observer.evidence = observer.evidence[0], observer.evidence[1] + gained
         detection = np.clip(detection + 0.05 * np.where(inside & lit, seen - detection, 0.0), 0.02, 0.97)
         self.detection.update(zip(pairs, detection, strict=True))
         return chosen
@@ -246,9 +258,10 @@ class NetEstimate(NetBelief):
             if member.node in self.places:
                 continue
             if not member.confirmed:
-                member.confirmed = member.evidence > CONFIRMED
+                least = min(member.evidence)
+                member.confirmed = sum(member.evidence) > CONFIRMED and least > EACH
                 late = self.t_s - member.since_s > PATIENCE_S
-                if not member.confirmed and (late or member.evidence < GIVEN_UP):
+                if not member.confirmed and (late or least < GIVEN_UP):
                     self.remove(index)
             elif self.t_s - member.light_s > LOST_S and self.sigma_m(index) > LOST_M:
                 self.remove(index)

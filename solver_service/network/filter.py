@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import heapq
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import Final
 
@@ -19,7 +19,7 @@ from buddyline.protocol.health import HEADINGS_APART_RAD
 from buddyline.protocol.messages import Blink
 from buddyline.solver_service.geometry.rotation import rotation_log, skew
 from buddyline.solver_service.network.belief import KnownPlace
-from buddyline.solver_service.network.estimate import CONTRADICTS, NetEstimate, PairFix
+from buddyline.solver_service.network.estimate import CONTRADICTS, Candidate, NetEstimate, PairFix
 from buddyline.solver_service.network.fixed import FixedWatch
 from buddyline.solver_service.network.rows import DueNetRow, NetRow, make_rows
 from buddyline.solver_service.network.trail import NetTrail
@@ -36,6 +36,8 @@ FIXES_TO_JOIN: Final = 3
 JOIN_WITHIN_S: Final = 1.5
 REACH_MPS: Final = 1.5
 REACH_RADPS: Final = 1.5
+# Of so many poses of one trigger that take each other's candidates at most it is worked out which are right.
+MOST_DISPUTED: Final = 10
 # A challenger replaces the estimate once it explains the pictures since its start better by this, after TRIED_S at
 # least; it is dropped after CHALLENGE_S, or when it is worse by REFUTED. No more are followed at a time.
 REPLACED: Final = 20.0
@@ -81,6 +83,8 @@ class NetFilter(TrackIntake):
         self._smoothed_s = -np.inf
         self.challengers: list[NetEstimate] = []
         self._fixes: dict[tuple[int, int], list[tuple[float, PairFix]]] = {}
+        # By trigger: the poses that are taken into account, or will be.
+        self._together: dict[int, list[PairFix]] = {}
         self._challenged_s: dict[tuple[int, int], float] = {}
         self._contradicted: dict[tuple[int, int], int] = {}
         self._watches: dict[int, FixedWatch] = {}
@@ -144,6 +148,14 @@ class NetFilter(TrackIntake):
         self._forget_before(end_s - MEMORY_S)
         return rows + make_rows(due)
 
+    def _forget_before(self, t_s: float) -> None:
+        super()._forget_before(t_s)
+        while self._together:
+            trigger = next(iter(self._together))
+            if self.pair_seconds(self._together[trigger][0].stamp_ns) >= t_s:
+                break
+            del self._together[trigger]
+
     def finish(self) -> list[NetRow]:
         """Return the rows that have not been smoothed yet, at the end of the dive."""
         return self._go_on(self._end_s) + self._smooth(np.inf) if self.smooths else []
@@ -168,6 +180,7 @@ class NetFilter(TrackIntake):
         trial.main.trail, trial.main.walked = None, walked
         trial.challengers, trial._watches, trial._problems = [], {}, Problems()
         trial._fixes, trial._challenged_s, trial._contradicted = {}, {}, {}
+        trial._together = self._together.copy()
         trial._rejected = self._rejected.copy()
         trial._events = sorted(event for event in self._events if event[1] != ROW)
         trial._go_on(self._events[0][0] + REHEARSED_S)
@@ -192,9 +205,16 @@ class NetFilter(TrackIntake):
                 estimate.trail.forget_before(until_s)
         return rows
 
-    def add_pair_fix(self, node: int, other: int, fix: FixSeen) -> None:
-        """Take a pose that one trigger's lights gave by themselves: of the node `other` from the node `node`."""
-        self.add_fix(PairFix(fix.stamp_ns, fix.t_a_b_m, fix.R_a_b, fix.covariance, node, other))
+    def add_pair_fix(self, node: int, other: int, fix: FixSeen, trigger: int, candidates: Iterable[Candidate]) -> None:
+        """Take a pose that one trigger's lights gave by themselves: of the node `other` from the node `node`.
+
+        candidates: what it takes for lamps.
+        """
+        found = PairFix(
+            fix.stamp_ns, fix.t_a_b_m, fix.R_a_b, fix.covariance, node, other, trigger, frozenset(candidates)
+        )
+        self._together.setdefault(trigger, []).append(found)
+        self.add_fix(found)
 
     def _beside(self, t_s: float) -> list[Sight]:
         """Take the other pictures of a trigger, less than TOGETHER_S after the first of t_s, out of the events.
@@ -268,7 +288,7 @@ class NetFilter(TrackIntake):
         one, two = main.member_of(fix.node), main.member_of(fix.other)
         if one is not None and two is not None:
             self._compare(t_s, fix, one, two)
-        elif _settled(recent):
+        elif _settled(recent) and not any(disputed(one, self._together.get(one.trigger, ())) for _, one in recent):
             _enter(main, t_s, fix)
             for challenger in self.challengers:
                 _enter(challenger, t_s, fix)
@@ -344,9 +364,36 @@ def _in_reach(before: tuple[float, PairFix], now: tuple[float, PairFix]) -> bool
     return moved_m < reach_m and turned < 2.0 * REACH_RADPS * span_s + 4.0 * sigma_rad
 
 
+def disputed(fix: PairFix, others: Sequence[PairFix]) -> bool:
+    """Whether a pose shares a candidate with another pose of its trigger, and may be the one that is wrong.
+
+    Of such poses those that together explain most candidates are right. Where two choices explain as many, what is not
+    in both is disputed.
+    """
+    about, rest = [fix], list(others)
+    while more := [one for one in rest if any(one.candidates & of.candidates for of in about)]:
+        about += [one for one in more if one is not fix]
+        rest = [one for one in rest if one not in more]
+    if len(about) > MOST_DISPUTED:
+        return True
+    choices = _without_contradiction(about)
+    explained = [sum(len(one.candidates) for one in choice) for choice in choices]
+    return any(fix not in of for of, n in zip(choices, explained, strict=True) if n == max(explained))
+
+
+def _without_contradiction(poses: Sequence[PairFix]) -> list[list[PairFix]]:
+    """Give all choices of poses in which no candidate is used twice."""
+    if not poses:
+        return [[]]
+    first, *rest = poses
+    beside = [one for one in rest if not one.candidates & first.candidates]
+    return [[first, *choice] for choice in _without_contradiction(beside)] + _without_contradiction(rest)
+
+
 def inverted(fix: PairFix) -> PairFix:
     """Give T_b_a of a pose T_a_b: t' = -R^T t, e_t' = -R^T (e_t + [t]x e_w), e_w' = -R^T e_w."""
     back = fix.R_a_b.T
     J = np.zeros((6, 6))
     J[:3, :3], J[:3, 3:], J[3:, 3:] = -back, -back @ skew(fix.t_a_b_m), -back
-    return PairFix(fix.stamp_ns, -back @ fix.t_a_b_m, back, J @ fix.covariance @ J.T, fix.other, fix.node)
+    P = J @ fix.covariance @ J.T
+    return PairFix(fix.stamp_ns, -back @ fix.t_a_b_m, back, P, fix.other, fix.node, fix.trigger, fix.candidates)
