@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Final, TypeAlias
@@ -17,15 +17,15 @@ from buddyline.solver_service.network.belief import Member, NetBelief
 from buddyline.solver_service.network.exclusive import share
 from buddyline.solver_service.network.rows import DueNetRow, NetRow, rows_of
 from buddyline.solver_service.network.sights import SightArrays, columns, light_positions
-from buddyline.solver_service.network.state import BLOCK, P_, PHI, V_, block, lone
+from buddyline.solver_service.network.state import BLOCK, P_, PHI, V_, NetState, block, lone
 from buddyline.solver_service.network.trail import Present, Told
 from buddyline.solver_service.track import anchors
-from buddyline.solver_service.track.association import Odds, doubt_of, odds_of
+from buddyline.solver_service.track.association import NOWHERE_PX, Odds, doubt_of, odds_of
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.intake import TrackIntake, newest_before
 from buddyline.solver_service.track.lights import Sight, in_picture, lasting_factor, pixels_of, residuals, with_stamp
 from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S
-from buddyline.solver_service.track.seeing import noise_of
+from buddyline.solver_service.track.seeing import ABOUT_STEPS, noise_of
 from buddyline.solver_service.track.start import tilt_of
 from buddyline.solver_service.track.stepping import TICK_S
 from buddyline.solver_service.track.visible import EDGE_PX
@@ -162,8 +162,23 @@ class NetEstimate(NetBelief):
         clutter = np.array([bar.sight.clutter / self.nodes[bar.sight.node].rig.camera.area_px2 for bar in bars])
         odds = odds_of(y, H, P[kept], candidates.sigma_px[kept], clutter)
         chosen = self._associate(bars, odds, inside)
-        if chosen:
-            self._update(bars, which, y, H, chosen)
+        if not chosen:
+            return
+
+        def compared(state: NetState) -> tuple[Floats, Floats]:
+            of_kept = [observers[n] for n in kept], [others[n] for n in kept], lights_m[kept]
+            return residuals(
+                candidates.bearings[kept],
+                candidates.tangents[kept],
+                *light_positions(state, *of_kept, self.rates_radps, times_s[kept]),
+            )
+
+        about = any(wide[kept[n]] and self._both_confirmed(bars[n]) for n, *_ in chosen)
+        self._update(bars, which, y, H, chosen, compared if about else None)
+
+    def _both_confirmed(self, bar: Bar) -> bool:
+        """Whether both members of a bar are confirmed."""
+        return self.members[bar.observer].confirmed and self.members[bar.other].confirmed
 
     def _within(self, bar: Bar, X: Floats, *, wide: bool) -> tuple[bool, bool] | None:
         """Tell which of a bar's lights ought to be in the picture by where they stand, X (2, 3) before the camera.
@@ -228,20 +243,41 @@ class NetEstimate(NetBelief):
         y: Floats,
         H: Floats,
         chosen: Sequence[tuple[int, int, int, float]],
+        compared: Callable[[NetState], tuple[Floats, Floats]] | None = None,
     ) -> None:
-        """Update by the lights chosen, each by bar, candidate, light and variance; which (B, WIDTH): as `columns`."""
+        """Update by the lights chosen, each by bar, candidate, light and variance; which (B, WIDTH): as `columns`.
+
+        compared: gives y and H about another state, None where they are linear enough. After seconds without light one
+        linear step from the prediction ends far from the lights, with the sigma of a sound one. These steps
+        (Gauss-Newton, the iterated update) end where the lights say.
+        """
+        assert self.state is not None
         n, k, light, variances = (np.array(each) for each in zip(*chosen, strict=True))
-        rows = np.zeros((len(chosen), 2, len(self.covariance)))
-        rows[np.arange(len(chosen))[:, None, None], [[0], [1]], which[n][:, None]] = H[n, k, light, :, :-1]
         for bar in (bars[one] for one, *_ in chosen):
             for member in (self.members[bar.other], self.members[bar.observer]):
                 member.light_s = max(member.light_s, bar.sight.t_s)
             self.members[bar.observer].looks_away = False
         counted = variances * [self._lasting_factor(bars[bar], candidate, of) for bar, candidate, of, _ in chosen]
-        noise = noise_of(counted, H[n, k, light, :, -1], np.array([id(bars[one].sight) for one in n]))
         sigma_px = [float(bars[bar].sight.sigma_px[candidate]) for bar, candidate, *_ in chosen]
         doubts = np.repeat([doubt_of(one, sigma) for one, sigma in zip(variances.tolist(), sigma_px, strict=True)], 2)
-        self._apply(rows.reshape(2 * len(chosen), -1), y[n, k, light].ravel(), noise, doubts)
+        pictures = np.array([id(bars[one].sight) for one in n])
+
+        def of_chosen(y: Floats, H: Floats) -> tuple[Floats, Floats, Floats]:
+            rows = np.zeros((len(chosen), 2, len(self.covariance)))
+            rows[np.arange(len(chosen))[:, None, None], [[0], [1]], which[n][:, None]] = H[n, k, light, :, :-1]
+            noise = noise_of(counted, H[n, k, light, :, -1], pictures)
+            return rows.reshape(2 * len(chosen), -1), y[n, k, light].ravel(), noise
+
+        rows = of_chosen(y, H)
+        for _ in range(ABOUT_STEPS - 1 if compared is not None else 0):
+            assert compared is not None
+            error = anchors.kalman(self.covariance, *rows).error
+            y, H = compared(self.state.plus(error))
+            if (np.abs(y[n, k, light]) >= NOWHERE_PX).any():
+                # One is behind the camera there.
+                break
+            rows = of_chosen(y + (H[..., :-1] @ error[which][:, None, None, :, None])[..., 0], H)
+        self._apply(*rows, doubts)
 
     def _lasting_factor(self, bar: Bar, k: int, light: int) -> float:
         """Give how many pictures tell as much as this one of a light, candidate k (track/seeing.counted); note it."""
