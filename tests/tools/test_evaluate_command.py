@@ -170,12 +170,30 @@ def test_logs_that_cannot_be_evaluated_give_a_one_line_error(tmp_path, capsys):
     assert "solve it first" in refused(capsys, write_log(tmp_path / "c.mcap", *INFOS.values(), frame("a", 0), *TRUTHS))
     assert "solve it first" in refused(capsys, write_log(tmp_path / "i.mcap", *INFOS.values()))
     later = write_log(tmp_path / "l.mcap", *(truth(k + 1000) for k in range(4)))
-    assert "is the truth of this dive" in refused(capsys, solved, "--truth", later)
+    assert f"is the truth in {later} of this dive" in refused(capsys, solved, "--truth", later)
     others = write_log(tmp_path / "x.mcap", *TRUTHS, pair="a/c")
     assert "no truth of pair a/b" in refused(capsys, solved, "--truth", others)
     (tmp_path / "empty.mcap").touch()
     assert "empty.mcap" in refused(capsys, tmp_path / "empty.mcap")
     assert "missing.mcap" in refused(capsys, solved, "--truth", tmp_path / "missing.mcap")
+
+
+def test_the_truth_of_another_dive_is_told_with_the_figures(tmp_path, capsys, caplog):
+    solved = write_log(tmp_path / "o.mcap", *INFOS.values(), *(pose(k) for k in range(12)))
+    other = write_log(tmp_path / "t.mcap", *(truth(k, (0.5, 0.0, 3.0)) for k in range(12)))
+    assert main(["evaluate", str(solved), "--truth", str(other), "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["accuracy"]["wrong"] == 12
+    assert f"{solved}: 12 of 12 poses or rows are wrong by the truth in {other}" in caplog.text
+    own = write_log(tmp_path / "s.mcap", *(truth(k, (0.1, 0.0, 3.0)) for k in range(12)))
+    caplog.clear()
+    assert evaluated(capsys, solved, "--truth", own)["accuracy"]["wrong"] == 0
+    assert not caplog.text
+
+
+def test_poses_that_are_wrong_by_the_truth_of_their_own_log_are_measured(tmp_path, capsys):
+    both = [each for k in range(12) for each in (pose(k), truth(k, (0.5, 0.0, 3.0)))]
+    solved = write_log(tmp_path / "o.mcap", *INFOS.values(), *both)
+    assert evaluated(capsys, solved)["accuracy"]["wrong"] == 12
 
 
 def test_several_pairs_need_a_choice(tmp_path, capsys):

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+from collections.abc import Iterable
 from dataclasses import asdict
+from typing import Final
 
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.draw import figures
@@ -18,9 +20,13 @@ from buddyline.tools.newfile import new_folder
 
 log = logging.getLogger(__name__)
 
+# Of two dives four fifths and more of all poses and rows are wrong, of one dive a few in a hundred at most. Fewer than
+# these say nothing: with dark lamps a dive may have one pose, and a wrong one.
+_MIN_COMPARED: Final = 10
+
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, print, and draw where asked for; return 0."""
+    """Measure, print, and draw where asked for; return 1 where truth and results are hardly of one dive, else 0."""
     if args.plots is not None:
         figures.check()
         new_folder(args.plots)
@@ -31,12 +37,16 @@ def run(args: argparse.Namespace) -> int:
         log.warning("%s", problem)
     result = evaluate(recorded)
     if result.poses and result.without_truth == result.poses:
-        raise BuddylineError(f"{args.logs[0]}: no pose has truth at its trigger or time; is the truth of this dive?")
+        raise BuddylineError(
+            f"{args.logs[0]}: no pose has truth at its trigger or time; is the truth"
+            f"{_of_truth(args)} of this dive? Name the log of this dive's truth with --truth T.mcap"
+        )
     print(json.dumps(as_dict(result), allow_nan=False) if args.json else as_text(result))
     if args.plots is not None:
         for path in write_figures(result, args.plots):
             log.info("%s", path)
-    return 0
+    compared = [(result.accuracy.wrong, result.accuracy.poses), *((one.wrong, one.samples) for one in result.tracks)]
+    return _tell_of_two_dives(args, compared)
 
 
 def _evaluate_network(args: argparse.Namespace) -> int:
@@ -44,4 +54,27 @@ def _evaluate_network(args: argparse.Namespace) -> int:
         raise BuddylineError("--plots and --pair: of a pair, not of a net")
     figures = network_figures(*load_network(args.logs, args.truth))
     print(json.dumps({"network": [asdict(one) for one in figures]}) if args.json else network_text(figures))
-    return 0
+    return _tell_of_two_dives(args, [(one.wrong, one.samples) for one in figures if not one.fixed])
+
+
+def _of_truth(args: argparse.Namespace) -> str:
+    """Return ` in` and the logs that truth may be from, beside the first."""
+    others = ", ".join(map(str, args.truth or args.logs[1:]))
+    return f" in {others}" if others else ""
+
+
+def _tell_of_two_dives(args: argparse.Namespace, compared: Iterable[tuple[int, int]]) -> int:
+    """Say where most of what was compared (wrong, of how many) is wrong by a truth of another log; return the status.
+
+    The figures stand: only poses may tell two dives of one time apart, and all poses of a dive may be wrong.
+    """
+    of_truth = _of_truth(args)
+    contradicted = next(((wrong, n) for wrong, n in compared if n >= _MIN_COMPARED and wrong > n / 2), None)
+    if not of_truth or contradicted is None:
+        return 0
+    log.warning(
+        "%s: %d of %d poses or rows are wrong by the truth%s: it seems to be of another dive; name the log of this "
+        "dive's truth with --truth T.mcap. If it is of this dive, look for clocks, bars or calibrations that are wrong",
+        *(args.logs[0], *contradicted, of_truth),
+    )
+    return 1
