@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import re
+from dataclasses import replace
 
 import cv2
 import msgspec
@@ -119,6 +121,29 @@ def test_one_bent_view_is_left_out_and_named():
     assert found.camera.fx_px == pytest.approx(boards.FOCAL_PX, rel=0.003)
 
 
+def test_good_views_of_an_excellent_set_are_kept():
+    seen = views(noise_px=0.02)
+    seen[3] = replace(seen[3], points_px=views(noise_px=0.2)[3].points_px)
+    assert camera.calibrate(seen, boards.SIZE, BOARD).dropped == ()
+
+
+def bent(view: BoardView, by_px: float) -> BoardView:
+    return replace(view, points_px=view.points_px + by_px * np.sin(view.points_px / 40))
+
+
+def test_a_view_that_does_not_fit_is_refused_where_it_cannot_be_left_out():
+    seen = views(8)
+    seen[3] = bent(seen[3], 6.0)
+    with pytest.raises(PoorCalibration, match=r"view 3 does not fit the others .* take more"):
+        camera.calibrate(seen, boards.SIZE, BOARD)
+
+
+def test_a_set_of_which_most_is_left_out_is_refused():
+    seen = [bent(view, 3.0 * 2.0 ** (i - 10) if i > 10 else 0.0) for i, view in enumerate(views(30))]
+    with pytest.raises(PoorCalibration, match=r"of 30 views do not fit the others: is the board flat"):
+        camera.calibrate(seen, boards.SIZE, BOARD)
+
+
 def test_pictures_of_a_board_at_rest_count_once():
     seen = views(4)
     still = [BoardView(f"{v.name} again {k}", v.ids, v.points_px + 0.1 * k) for v in seen for k in range(10)]
@@ -200,9 +225,9 @@ def info(width_px: int = 640) -> NodeInfo:
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """A folder of pictures in which the board is where the known camera sees it."""
-    seen = iter(views())
+def folder(tmp_path, monkeypatch, request):
+    """A folder of pictures in which the board is where the known camera sees it, with noise as asked for."""
+    seen = iter(views(noise_px=getattr(request, "param", 0.1)))
 
     def find(self, name, image):
         self.size = boards.SIZE
@@ -231,6 +256,14 @@ def test_command_writes_what_the_node_and_the_solver_take(folder, capsys):
     assert cv2.imread(str(picture)) is not None
     with pytest.raises(BuddylineError, match="exists"):
         calibrate._write_info(str(new), written)
+
+
+@pytest.mark.parametrize(("folder", "poor"), [(0.1, False), (0.5, True)], indirect=["folder"])
+def test_command_says_that_all_views_fit_poorly(folder, poor, caplog):
+    pictures = map(str, sorted(folder.glob("*.png")))
+    assert calibrate.run(arguments("camera", *pictures, "--picture", str(folder / "result.jpg"))) == 0
+    warned = [record.message for record in caplog.records if record.levelno == logging.WARNING]
+    assert [text.startswith("all views fit poorly: 0.") for text in warned] == [True] * poor
 
 
 def test_command_refuses_a_calibration_of_another_resolution(folder):

@@ -22,9 +22,12 @@ MOVED_SHARE: Final = 0.03
 GRID: Final = (8, 6)
 LEAST_COVERAGE: Final = 0.6
 MOST_RMS_PX: Final = 1.0
+# What sharp pictures of a flat board stay below. A view that does is never left out; a fit that does not is told.
+GOOD_RMS_PX: Final = 0.5
 LEAST_TILT_RAD: Final = np.radians(7.0)
 MOST_FOCAL_SIGMA: Final = 0.005
 OUTLIER_VIEWS: Final = 2.5
+_BOARD: Final = "is the board flat and sharp, and --columns, --rows and --square-mm those of the print?"
 
 
 @dataclass(frozen=True)
@@ -124,16 +127,26 @@ def calibrate(views: list[BoardView], size: tuple[int, int], board: Board) -> Ca
     while True:
         found, per_view_px = _solve(views, size, corners, tuple(dropped))
         worst = int(per_view_px.argmax())
-        if per_view_px[worst] < OUTLIER_VIEWS * np.median(per_view_px) or len(views) <= LEAST_VIEWS:
+        if per_view_px[worst] < max(OUTLIER_VIEWS * np.median(per_view_px), GOOD_RMS_PX):
             break
+        require(
+            (
+                len(views) > LEAST_VIEWS,
+                f"{views[worst].name} does not fit the others ({per_view_px[worst]:.1f} px), and without it there are "
+                f"fewer than {LEAST_VIEWS} views: take more",
+            )
+        )
         dropped.append(views[worst].name)
         views = views[:worst] + views[worst + 1 :]
     focal_share = max(found.sigma_px[0] / found.camera.fx_px, found.sigma_px[1] / found.camera.fy_px)
     require(
         (
+            len(dropped) <= len(views),
+            f"{len(dropped)} of {len(dropped) + len(views)} views do not fit the others: {_BOARD}",
+        ),
+        (
             found.rms_px <= MOST_RMS_PX,
-            f"reprojection error {found.rms_px:.2f} px, allowed are {MOST_RMS_PX:.1f} px: "
-            "is the board flat and sharp, and --columns, --rows and --square-mm those of the print?",
+            f"reprojection error {found.rms_px:.2f} px, allowed are {MOST_RMS_PX:.1f} px: {_BOARD}",
         ),
         (
             found.coverage >= LEAST_COVERAGE,

@@ -153,7 +153,7 @@ def _board(args: argparse.Namespace) -> None:
 
 
 def _camera(args: argparse.Namespace) -> None:
-    from buddyline.tools.calibration.camera import CornerFinder, calibrate, distinct, draw
+    from buddyline.tools.calibration.camera import GOOD_RMS_PX, CornerFinder, calibrate, distinct, draw
     from buddyline.tools.calibration.inputs import pictures
     from buddyline.tools.calibration.pictures import write_picture
     from buddyline.tools.dives import load_info
@@ -177,6 +177,11 @@ def _camera(args: argparse.Namespace) -> None:
     )
     for name in found.dropped:
         log.info("left out, it does not fit the others: %s", name)
+    if found.rms_px > GOOD_RMS_PX:
+        log.warning(
+            f"all views fit poorly: {found.rms_px:.2f} px, good ones stay below {GOOD_RMS_PX} px; take sharper "
+            "pictures of a flat board, held still"
+        )
     if args.new_info:
         info = load_info(args.info)
         if (info.width_px, info.height_px) != found.size:
