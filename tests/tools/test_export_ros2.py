@@ -17,7 +17,7 @@ from buddyline.tools.cli import main
 from buddyline.tools.export.enu import BaseCamera
 from msgspec.structs import replace
 
-from tests.tools.evaluated import INFOS, pose, rejection, track, write_log
+from tests.tools.evaluated import INFOS, pose, rejection, track, truth, write_log
 from tests.tools.watched import PNG, at, attitude, depth, image, solver_status, status
 
 RNG = np.random.default_rng(3)
@@ -197,3 +197,21 @@ def test_the_csv_of_poses_has_the_whole_covariance(
             assert float(rows[stamp_ns][f"sd_{one}_{'m' if i < 3 else 'rad'}"]) == math.sqrt(covariance[i, i])
             for k in range(i, 6):
                 assert float(rows[stamp_ns][f"cov_{one}_{axes[k]}"]) == covariance[i, k]
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        ((), "nothing to export in it: no pose, track, attitude, depth or picture (it holds buddyline/pair/a/b/truth)"),
+        (("--what", "poses"), "no poses in it; solve it"),
+        (("--what", "track"), "no track in it; solve it"),
+    ],
+)
+def test_a_log_without_what_is_asked_for_gives_no_ros_log(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], named: str
+) -> None:
+    pytest.importorskip("rosbags", reason="rosbags is not installed")
+    log, output = write_log(tmp_path / "t.mcap", truth(0)), tmp_path / "ros.mcap"
+    assert main(["export", str(log), "--format", "mcap-ros2", "-o", str(output), *words]) == 2
+    assert named in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["t.mcap"]

@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Rejected, RelativePose, Track, Truth
+from buddyline.protocol.topics import POSE, TRACK, TRACK_LAG
 from buddyline.tools.columns import in_order, of_mode
 from buddyline.tools.evaluation.logs import load
 from buddyline.tools.evaluation.network import shows_network
@@ -50,6 +51,7 @@ _CSV_FIELDS: Final = (
     *_TRUTH_FIELDS,
 )
 NO_POSES: Final = "no poses in it; solve it first: buddyline solve DIVE.mcap -o OUT.mcap"
+NO_TRACK: Final = "no track in it; solve it: buddyline solve DIVE.mcap -o OUT.mcap"
 _REASON_FIELDS: Final = ("reason", "detail")
 _TRACK_FIELDS: Final = (
     *("stamp_ns", "node_a", "node_b", "mode"),
@@ -156,7 +158,7 @@ def chosen(recorded: Recorded, what: str | None, name: str) -> tuple[str, list[R
     """Return the best track, or the poses, in words and in order; what: "track", "poses", or None for the better."""
     track = [] if what == "poses" else in_order(of_mode(recorded.tracks))
     if what == "track" and not track:
-        raise BuddylineError(f"{name}: no track in it; solve it: buddyline solve DIVE.mcap -o OUT.mcap")
+        raise BuddylineError(f"{name}: {NO_TRACK}")
     if track:
         other = "; `export --what poses` gives the poses" if what is None and recorded.poses else ""
         return f"the track ({track[0].mode}), {len(track)} rows{other}", track
@@ -205,6 +207,9 @@ def _export_file(args: argparse.Namespace, form: ExportFormat) -> int:
     with Dive(args.logs) as dive:
         if args.what == "net":
             first_with_net([dive])
+        wanted = {"poses": (POSE,), "track": (TRACK, TRACK_LAG)}.get(args.what, ())
+        if wanted and not dive.ids(*(topic.name for topic in wanted)):
+            raise BuddylineError(f"{dive.name}: {NO_TRACK if args.what == 'track' else NO_POSES}")
         count = module.export(dive, args.output, args.what)
     print(f"{args.output}: {count} {form.counts}", file=sys.stderr)
     return 0

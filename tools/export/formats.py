@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+from buddyline.protocol.errors import BuddylineError
+
+if TYPE_CHECKING:
+    from buddyline.tools.dives import Dive
 
 
 @dataclass(frozen=True)
@@ -56,3 +61,13 @@ FORMATS: Final = (
 def format_of(name: str) -> ExportFormat:
     """Return the format of this name."""
     return next(each for each in FORMATS if each.name == name)
+
+
+def check_shows(dive: Dive, count: int) -> None:
+    """Raise BuddylineError if nothing of a dive is in its export."""
+    if not count:
+        held = ", ".join(dive.keys) or "no message"
+        raise BuddylineError(
+            f"{dive.name}: nothing to export in it: no pose, track, attitude, depth or picture (it holds {held}); name "
+            "the dive's own logs, too, or solve it: buddyline solve DIVE.mcap -o OUT.mcap"
+        )

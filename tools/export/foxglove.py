@@ -21,7 +21,6 @@ import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.divelog import CHUNK_NS
 from buddyline.protocol.envelope import Envelope
-from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import (
     Attitude,
     Blob,
@@ -39,6 +38,7 @@ from buddyline.protocol.topics import NET_POSE, TRACK, TRACK_LAG
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
 from buddyline.tools.dives import Dive
 from buddyline.tools.export.enu import R_ENU_NED, BaseCamera, FrameTree, NetDepths, net_enu
+from buddyline.tools.export.formats import check_shows
 from buddyline.tools.export.foxglove_layout import LOG, TRANSFORMS, WORLD, layout
 from buddyline.tools.extras import needed
 from buddyline.tools.health.words import Sayings
@@ -373,6 +373,7 @@ def export(dive: Dive, output: Path, what: str | None = None) -> int:
             else:
                 channels.add(topic, stamp_ns, message)
         writer.finish()
+        check_shows(dive, channels.count)
     pair = next((ids for ids in dive.ids("pose", "track", "track_lag")), None)
     # A net is looked at from outside, a pair from A.
     base = None if nets else base_of(dive)
@@ -422,11 +423,9 @@ class _Channels:
 def track_of(dive: Dive, what: str | None) -> str | None:
     """Return the topic of the best track in a dive: for a live dive, the one that is a second late.
 
-    None without a track, or if what is "poses"; a BuddylineError if what is "track" and there is none.
+    None without a track, or if what is "poses".
     """
     track = next((topic.name for topic in (TRACK_LAG, TRACK) if dive.ids(topic.name)), None)
-    if what == "track" and track is None:
-        raise BuddylineError(f"{dive.name}: no track in it; solve it: buddyline solve DIVE.mcap -o OUT.mcap")
     return None if what == "poses" else track
 
 

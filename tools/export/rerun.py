@@ -27,6 +27,7 @@ from buddyline.protocol.messages import (
 from buddyline.protocol.topics import NET_POSE
 from buddyline.tools.dives import Dive
 from buddyline.tools.export.enu import BaseCamera, NetDepths, net_enu
+from buddyline.tools.export.formats import check_shows
 from buddyline.tools.export.foxglove import LAMP_M, LEFT, OTHER, RIGHT, SERIES, base_of, nets_of, track_of
 from buddyline.tools.extras import needed
 from buddyline.tools.health.words import Sayings
@@ -36,7 +37,7 @@ from buddyline.tools.newfile import new_file
 def export(dive: Dive, output: Path, what: str | None = None) -> int:
     """Write a dive into output, which must not exist; return how many of its messages it has.
 
-    what: "poses" leaves the track out, "track" asks for one; None: with the track if there is one.
+    what: "poses" leaves the track out; None: with the track if there is one.
     """
     # It only writes a file: no usage is reported.
     os.environ.setdefault("RERUN_ANALYTICS", "0")
@@ -61,6 +62,7 @@ def export(dive: Dive, output: Path, what: str | None = None) -> int:
                 drawing.take(envelope.message, is_track=envelope.topic.name == track)
             count += 1
         recording.disconnect()
+        check_shows(dive, count)
     return count
 
 

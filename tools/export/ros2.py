@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from buddyline.protocol.divelog import CHUNK_NS
-from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.errors import MessageError
 from buddyline.protocol.topics import NET_POSE
 from buddyline.tools.dives import Dive
+from buddyline.tools.export.formats import check_shows
 from buddyline.tools.export.ros_messages import Translation, type_store
 from buddyline.tools.newfile import new_file
 
@@ -29,8 +30,6 @@ def export(dive: Dive, output: Path, what: str | None = None) -> int:
     store = type_store()
     translation = Translation(store.types)
     left_out = {"poses": {"track", "track_lag"}, "track": {"pose"}}.get(what or "", set())
-    if what == "track" and not dive.ids("track", "track_lag"):
-        raise BuddylineError(f"{dive.name}: no track in it; solve it: buddyline solve DIVE.mcap -o OUT.mcap")
     topics = [topic for topic in (*TOPICS, "solver_status") if topic not in left_out]
     count = refused = cut_ns = 0
     channels: dict[str, int] = {}
@@ -61,6 +60,7 @@ def export(dive: Dive, output: Path, what: str | None = None) -> int:
                 writer.add_message(channel, envelope.time_ns, data, stamp_ns, count & 0xFFFFFFFF)
                 count += 1
         writer.finish()
+        check_shows(dive, count)
     if refused:
         log.warning("%s: %d messages have times after 2038, which ROS 2 cannot say: left out", dive.name, refused)
     return count
