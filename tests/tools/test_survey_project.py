@@ -196,6 +196,25 @@ def test_a_station_that_is_fixed_twice_is_refused(tmp_path, logs):
         run("adjust", path)
 
 
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('[[fix]]\nstation = "gone"\neast_m = 0\nnorth_m = 0', "fix of 'gone': no leg has this station"),
+        ('[[known]]\nfrom = "entry"\nto = "gone"\ndistance_m = 1', "known line entry-gone: no leg has station gone"),
+        ('[[known]]\nfrom = "entry"\nto = "entry"\ndistance_m = 1', "known line entry-entry: both ends"),
+        ('[adjust]\ncompass = "ignore"', "adjust.compass"),
+        ('[[equate]]\nstations = ["entry", "gone"]', "equate of 'gone': no leg has this station"),
+    ],
+)
+def test_errors_in_fixed_points_and_known_lines_name_the_file(tmp_path, logs, text, said):
+    path = tmp_path / "cave.toml"
+    run("legs", path, "--dive", *logs)
+    path.write_text(path.read_text().replace(MARKER, f"{text}\n{MARKER}"))
+    with pytest.raises(ConfigError) as raised:
+        run("legs" if "equate" in text else "adjust", path)
+    assert str(raised.value).startswith(f"{path}: {said}")
+
+
 def test_a_better_calibration_updates_the_survey(tmp_path, logs, messages):
     path = tmp_path / "cave.toml"
     run("legs", path, "--dive", *logs)

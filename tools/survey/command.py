@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from buddyline.protocol.config import ConfigError
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.options import above_zero
 from buddyline.protocol.security import SURVEYOR
@@ -131,6 +133,15 @@ def run(args: argparse.Namespace) -> int:
     return status
 
 
+@contextmanager
+def _naming(project: Path) -> Iterator[None]:
+    """Put a project's name before the errors of what it says."""
+    try:
+        yield
+    except BuddylineError as error:
+        raise ConfigError(f"{project}: {error}") from error
+
+
 def _watch(args: argparse.Namespace) -> int:
     from buddyline.tools.survey.live import run_watch
 
@@ -184,11 +195,13 @@ def _legs(args: argparse.Namespace) -> int:
     derived = Derived()
     for number, one in enumerate(project.dive, 1):
         pairs = read.get(number) or of_logs([str(path.parent / log) for log in one.logs])
-        by_hand = of_project(marks, number, int(pairs[0].stamps_ns[0]))
-        derived.add(pairs, project.settings, project.alarms, number, by_hand)
-    for same in own_equates(project):
-        derived.equate(same)
-    gauges = adjust_gauges(derived.legs, project.alarms)
+        with _naming(path):
+            by_hand = of_project(marks, number, int(pairs[0].stamps_ns[0]))
+            derived.add(pairs, project.settings, project.alarms, number, by_hand)
+    with _naming(path):
+        for same in own_equates(project):
+            derived.equate(same)
+        gauges = adjust_gauges(derived.legs, project.alarms)
     stations = derived.stations(gauges.depths)
     for text in gauges.alarms:
         derived.add_problem(text)
@@ -228,7 +241,8 @@ def _import(args: argparse.Namespace) -> int:
     project = load_project(path) if path.exists() else Project(survey=About(name=path.stem))
     whole = structs.replace(project, old=project.old + added)
     olds = read_project_files(whole, path.parent)
-    joined(whole, olds)
+    with _naming(path):
+        joined(whole, olds)
     if path.exists():
         add_old(path, added)
     else:
@@ -254,10 +268,11 @@ def _sheet(args: argparse.Namespace) -> Sheet:
 
     project = load_project(args.project)
     olds = read_project_files(project, args.project.parent)
-    project = joined(project, olds)
-    if args.depth:
-        project = replace(project, adjust=replace(project.adjust, depth=args.depth))
-    return Sheet(project, adjust(project), olds)
+    with _naming(args.project):
+        project = joined(project, olds)
+        if args.depth:
+            project = replace(project, adjust=replace(project.adjust, depth=args.depth))
+        return Sheet(project, adjust(project), olds)
 
 
 def _adjust(args: argparse.Namespace) -> int:
@@ -289,7 +304,10 @@ def _report(args: argparse.Namespace) -> int:
     from buddyline.tools.newfile import write_output
     from buddyline.tools.survey import report
 
-    write_output(args.output or str(args.project.with_suffix(".html")), report.page(_sheet(args)))
+    sheet = _sheet(args)
+    with _naming(args.project):
+        page = report.page(sheet)
+    write_output(args.output or str(args.project.with_suffix(".html")), page)
     return 0
 
 
@@ -302,7 +320,9 @@ def _export(args: argparse.Namespace) -> int:
         raise BuddylineError(f"--style {args.style}: {args.format} has no such style ({known})")
     target = args.output or str(args.project.with_suffix(FORMATS[args.format]))
     sheet = _sheet(args)
-    write_output(target, exported(sheet, args.format, args.style))
+    with _naming(args.project):
+        content = exported(sheet, args.format, args.style)
+    write_output(target, content)
     if sheet.olds and args.format == "dat":
         print(f"{args.project}: left out: old surveys, which dat has not; svx and th have them", file=sys.stderr)
         return 1
