@@ -79,6 +79,13 @@ def test_a_project_from_dive_to_exports(tmp_path, logs, capsys):
     assert "<svg" in (tmp_path / "cave.html").read_text()
 
 
+@pytest.mark.parametrize("words", [["report"], ["export", "--format", "svx"]])
+@pytest.mark.parametrize("project", ["/dev/stdin", "/dev/fd/0", "/proc/self/fd/0"])
+def test_beside_standard_input_nothing_is_written(words, project):
+    with pytest.raises(BuddylineError, match="name it with -o"):
+        run(words[0], project, *words[1:])
+
+
 @pytest.mark.parametrize("words", [["report"], ["export", "--format", "svx"], ["export", "--format", "pdf"]])
 def test_exports_and_reports_refuse_to_overwrite(tmp_path, logs, words):
     path = tmp_path / "cave.toml"

@@ -300,14 +300,23 @@ def _is_stale(args: argparse.Namespace, sheet: Sheet) -> bool:
     return True
 
 
+def _target(args: argparse.Namespace, ending: str) -> str:
+    """Return the output's name, by default beside the project."""
+    project: Path = args.project
+    if args.output is None and project.parent in (Path("/dev"), Path("/dev/fd"), Path("/proc/self/fd")):
+        raise BuddylineError(f"{project}: the output cannot be beside it; name it with -o")
+    return str(args.output or project.with_suffix(ending))
+
+
 def _report(args: argparse.Namespace) -> int:
     from buddyline.tools.newfile import write_output
     from buddyline.tools.survey import report
 
+    target = _target(args, ".html")
     sheet = _sheet(args)
     with _naming(args.project):
         page = report.page(sheet)
-    write_output(args.output or str(args.project.with_suffix(".html")), page)
+    write_output(target, page)
     return 0
 
 
@@ -318,7 +327,7 @@ def _export(args: argparse.Namespace) -> int:
     if args.style not in STYLES.get(args.format, ("auto",)):
         known = "; ".join(f"{name}: {', '.join(styles)}" for name, styles in STYLES.items())
         raise BuddylineError(f"--style {args.style}: {args.format} has no such style ({known})")
-    target = args.output or str(args.project.with_suffix(FORMATS[args.format]))
+    target = _target(args, FORMATS[args.format])
     sheet = _sheet(args)
     with _naming(args.project):
         content = exported(sheet, args.format, args.style)
