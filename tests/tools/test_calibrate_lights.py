@@ -187,5 +187,13 @@ def test_command_refuses_a_place_where_something_moved_or_nothing_was_solved(sol
     path, *_ = solved
     with pytest.raises(BuddylineError, match="0-12 s: the lights moved"):
         calibrate.run(arguments("lights", str(path), "--tape", "0", "12", "2.0"))
-    with pytest.raises(BuddylineError, match="3-9 s: 0 fixes"):
+    with pytest.raises(BuddylineError, match=r"--tape 3-9 s: no fix; those of a/b are from 0.0 to .* choose seconds"):
         calibrate.run(arguments("lights", str(path), "--tape", "3", "9", "2.0"))
+    with pytest.raises(BuddylineError, match=r"0-0.2 s: 3 fixes with all four lights, of 3 fixes; 5 are .* longer"):
+        calibrate.run(arguments("lights", str(path), "--tape", "0", "0.2", "2.0"))
+
+
+@pytest.mark.parametrize("tape", [("5", "1", "2"), ("1", "5", "-2")])
+def test_a_tape_that_says_no_place_is_refused(solved, tape):
+    with pytest.raises(BuddylineError, match=f"--tape {' '.join(tape)}: give BEGIN_S END_S METRES"):
+        calibrate.run(arguments("lights", str(solved[0]), "--tape", *tape))

@@ -77,6 +77,12 @@ def places(
 
     nodes: the pair; None if the dive has only one.
     """
+    for begin_s, end_s, distance_m in tapes:
+        if begin_s >= end_s or distance_m <= 0.0:
+            raise BuddylineError(
+                f"--tape {begin_s:g} {end_s:g} {distance_m:g}: give BEGIN_S END_S METRES: the begin before the end, in "
+                "seconds of the dive, and a distance above 0"
+            )
     with Dive(paths) as dive:
         infos = dive.infos()
         pairs = [ids for ids in dive.ids("pose") if nodes is None or set(ids) == set(nodes)]
@@ -97,10 +103,16 @@ def places(
     missing = [node for node in pair if node not in infos]
     if missing:
         raise BuddylineError(f"no calibration of node {missing[0]} in the log")
-    found = [
-        _place(f"{begin:g}-{end:g} s", [pose for t, pose in poses if begin <= t <= end], frames, distance_m)
-        for begin, end, distance_m in tapes
-    ]
+    found = []
+    for begin, end, distance_m in tapes:
+        name, resting = f"{begin:g}-{end:g} s", [pose for t, pose in poses if begin <= t <= end]
+        if not resting:
+            times_s = [t for t, _ in poses] or [0.0]
+            raise BuddylineError(
+                f"--tape {name}: no fix; those of {'/'.join(pair)} are from {min(times_s):.1f} to {max(times_s):.1f} s "
+                "of the dive (`buddyline view` shows when): choose seconds in which both rested and saw each other"
+            )
+        found.append(_place(name, resting, frames, distance_m))
     return found, (infos[pair[0]], infos[pair[1]])
 
 
@@ -115,11 +127,19 @@ def _place(
         seen.append([[a.blobs[i].u_px, a.blobs[i].v_px] for i in pose.blobs_a])
         seen[-1] += [[b.blobs[i].u_px, b.blobs[i].v_px] for i in pose.blobs_b]
     if len(seen) < LEAST_FIXES:
-        raise BuddylineError(f"{name}: {len(seen)} fixes with all four lights, {LEAST_FIXES} are needed")
+        why = "longer, or other seconds, in which each saw both lights of the other"
+        if not frames:
+            why = "the logs have no candidates, so name the dive's own logs, too"
+        raise BuddylineError(
+            f"--tape {name}: {len(seen)} fixes with all four lights, of {len(poses)} fixes; {LEAST_FIXES} are needed: "
+            f"{why}"
+        )
     pixels = np.array(seen)
     moved_px = float(np.abs(pixels - np.median(pixels, axis=0)).mean())
     if moved_px > REST_PX:
-        raise BuddylineError(f"{name}: the lights moved by {moved_px:.1f} px; both nodes must be at rest")
+        raise BuddylineError(
+            f"--tape {name}: the lights moved by {moved_px:.1f} px; both nodes must be at rest: choose other seconds"
+        )
     middle = np.median(pixels, axis=0)
     pose = poses[len(poses) // 2]
     return TapedPlace(
