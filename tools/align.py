@@ -15,7 +15,7 @@ from buddyline.solver_service.config import SolveConfig, track_settings
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.track.clocks import Clocks
 from buddyline.tools.dives import Dive
-from buddyline.tools.solve import messages_of, pair_of
+from buddyline.tools.solve import CLOCK_KNOWN_S, messages_of, pair_of
 
 log = logging.getLogger(__name__)
 
@@ -30,7 +30,11 @@ def run(args: argparse.Namespace) -> int:
         pair = pair_of(dive, args.nodes)
         found = clocks_of(dive, pair, args.detector, args.environment)
     if found is None:
-        log.error("align: the fixes do not tell the offset: they are too few, or the pair did not move")
+        log.error(
+            "align: the fixes do not tell the offset within %.0f ms: they are too few, or the pair did not move; take a "
+            "stretch in which it moved while it saw each other's lights",
+            1e3 * CLOCK_KNOWN_S,
+        )
         return 1
     if args.json:
         print(clocks_json(pair, found))
@@ -45,7 +49,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def clocks_of(dive: Dive, pair: tuple[str, str], detector: str, environment: str) -> Clocks | ClockOffset | None:
-    """Return what the dive tells of the clocks of a pair, None for nothing; raise BuddylineError for no fix."""
+    """Return what the dive tells of the clocks of a pair, None for nothing; raise BuddylineError for no fix.
+
+    An offset that is not known to CLOCK_KNOWN_S would make poses worse, and is nothing.
+    """
+    missing = [node for node in pair if node not in dive.infos()]
+    if missing:
+        raise BuddylineError(f"{dive.name}: no NodeInfo of node {missing[0]}; name a log that has it, too")
     left = found = _pass(dive, pair, detector, environment, 0.0, 1)
     # By gaps alone, each pass corrects B's times by the offset found so far, until what is left is below its sigma.
     number = 1
@@ -55,7 +65,7 @@ def clocks_of(dive: Dive, pair: tuple[str, str], detector: str, environment: str
         number += 1
         left = _pass(dive, pair, detector, environment, found.offset_s, number)
         found = left and ClockOffset(found.offset_s + left.offset_s, left.sigma_s, left.fixes)
-    return found
+    return found if found is not None and found.sigma_s < CLOCK_KNOWN_S else None
 
 
 def clocks_json(pair: tuple[str, str], found: Clocks | ClockOffset) -> str:
@@ -65,7 +75,7 @@ def clocks_json(pair: tuple[str, str], found: Clocks | ClockOffset) -> str:
 
 def _drift_text(found: Clocks | ClockOffset) -> str:
     if isinstance(found, ClockOffset):
-        return "the drift is not told: not both nodes have inertial samples"
+        return "the drift is not told: that takes inertial samples of both nodes throughout"
     if found.drift is not None and found.drift_sigma is not None:
         return f"it gains {found.drift * 1e6:+.1f} us a second (1 sd {found.drift_sigma * 1e6:.1f})"
     if found.drift_sigma is None:
@@ -92,5 +102,9 @@ def _pass(
         core.handle(envelope.message)
     found = core.pairs[pair].clocks()
     if not core.counts["solved"]:
-        raise BuddylineError(f"{dive.name}: no trigger was solved, so that nothing tells the clocks' offset")
+        why = ", ".join(f"{count} {reason}" for reason, count in core.counts.most_common())
+        raise BuddylineError(
+            f"{dive.name}: no fix tells the clocks' offset ({why or 'no candidates'}): name logs of seconds in which "
+            f"{pair[0]} and {pair[1]} saw each other's lights"
+        )
     return found
