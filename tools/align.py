@@ -15,7 +15,7 @@ from buddyline.solver_service.config import SolveConfig, track_settings
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.track.clocks import Clocks
 from buddyline.tools.dives import Dive
-from buddyline.tools.solve import CLOCK_KNOWN_S, messages_of, pair_of
+from buddyline.tools.solve import CLOCK_KNOWN_S, check_detector, messages_of, pair_of
 
 log = logging.getLogger(__name__)
 
@@ -28,11 +28,12 @@ def run(args: argparse.Namespace) -> int:
     """Estimate offset and drift; return 1 where the dive does not tell the offset."""
     with Dive(args.dives) as dive:
         pair = pair_of(dive, args.nodes)
+        check_detector(dive, pair, args.detector, args.environment)
         found = clocks_of(dive, pair, args.detector, args.environment)
     if found is None:
         log.error(
-            "align: the fixes do not tell the offset within %.0f ms: they are too few, or the pair did not move; take a "
-            "stretch in which it moved while it saw each other's lights",
+            "align: the fixes do not tell the offset within %.0f ms: they are too few, or the pair did not move; take "
+            "seconds in which both moved and saw each other's lights",
             1e3 * CLOCK_KNOWN_S,
         )
         return 1

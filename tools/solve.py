@@ -13,6 +13,7 @@ from itertools import combinations, islice
 from pathlib import Path
 from typing import Final
 
+from buddyline.node.choices import DETECTORS
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import ConfigError, load_config
 from buddyline.protocol.divelog import DiveLogWriter
@@ -59,6 +60,7 @@ def run(args: argparse.Namespace) -> int:
         replaced |= placed(args.place, dive.infos() | replaced)
         nodes, infos = nodes_of(dive, args.nodes), dive.infos() | replaced
         nodes = _with_info(dive, nodes, infos, given=args.nodes is not None)
+        check_detector(dive, nodes, args.detector, args.environment)
         if len(nodes) > 2 and (args.clock_offset is not None or args.clocks is not None):
             raise ConfigError("--clock-offset and --clocks are of one pair; choose it with --nodes A B")
         # Nodes of lamps alone, or of a camera alone, are in the network, and in no pair.
@@ -107,7 +109,10 @@ def run(args: argparse.Namespace) -> int:
     if not core.counts.total():
         log.error("no trigger was resolved: the dive holds no candidates of %s", " or ".join(nodes))
     elif not core.matched:
-        log.error("nodes %s have no trigger in common: are the logs of the same dive?", " and ".join(nodes))
+        # Two rates are named already.
+        one_rate = len({infos[node].trigger_period_ns for node in nodes}) == 1
+        why = ": are the logs of the same dive?" if one_rate else ""
+        log.error("nodes %s have no trigger in common%s", " and ".join(nodes), why)
     return 0 if core.matched else 1
 
 
@@ -215,11 +220,31 @@ def _with_info(dive: Dive, nodes: list[str], infos: Mapping[str, NodeInfo], *, g
     return known
 
 
+def _pictured(dive: Dive, nodes: Iterable[str]) -> list[str]:
+    """Return the nodes of which a dive has pictures and no candidates."""
+    return [node for node in nodes if node in dive.nodes("image") and node not in dive.nodes("candidates")]
+
+
+def check_detector(dive: Dive, nodes: Iterable[str], detector: str, environment: str) -> None:
+    """Say where a detector that was asked for has nothing to do; raise BuddylineError for an unknown one."""
+    if (detector, environment) == (DETECTORS[0], "auto"):
+        return
+    from buddyline.node.detect import values_of
+
+    values_of(detector, environment)
+    if not _pictured(dive, nodes):
+        log.warning(
+            "%s: its candidates are taken as they are: --detector and --environment are for nodes with pictures and "
+            "without candidates; `buddyline detect` finds candidates anew",
+            dive.name,
+        )
+
+
 def messages_of(
     dive: Dive, infos: dict[str, NodeInfo], *nodes: str, detector: str, environment: str, doing: str
 ) -> Iterator[Envelope]:
     """Yield the messages for solver and output; pictures of a node without candidates are detected."""
-    raw = [node for node in nodes if node in dive.nodes("image") and node not in dive.nodes("candidates")]
+    raw = _pictured(dive, nodes)
     finder = None
     if raw:
         from buddyline.tools.detect import DiveDetector, recorded_masks

@@ -114,6 +114,33 @@ def test_solve_names_a_node_whose_pictures_have_another_size_than_its_calibratio
     assert "  no track (smooth): " in out
 
 
+@pytest.mark.parametrize("two_rates", [True, False])
+def test_solve_asks_whether_logs_are_of_one_dive_where_nothing_else_explains_it(capsys, caplog, tmp_path, two_rates):
+    with DiveLogWriter(tmp_path / "dive.mcap") as writer:
+        for message in dive_messages(seconds=3.0)[0]:
+            changes = {}
+            of_b = getattr(message, "node", "") == "b"
+            if of_b and isinstance(message, NodeInfo) and two_rates:
+                changes = {"trigger_period_ns": 2 * message.trigger_period_ns}
+            elif of_b and isinstance(message, Candidates):
+                changes = {"trigger": message.trigger // 2} if two_rates else {"trigger": message.trigger + 9000}
+            writer.write_message(replace(message, **changes))
+    status, _, _ = run(capsys, "solve", tmp_path / "dive.mcap", "-o", tmp_path / "out.mcap")
+    assert status == 1
+    assert "nodes a and b have no trigger in common" in caplog.text
+    assert ("pictures a second: give both one `rate_hz`" in caplog.text) == two_rates
+    assert ("are the logs of the same dive?" in caplog.text) != two_rates
+
+
+def test_solve_names_a_detector_that_it_does_not_use(capsys, caplog, dive_log, tmp_path):
+    run(capsys, "solve", dive_log, "-o", tmp_path / "out.mcap", "--detector", "paper")
+    assert "its candidates are taken as they are: --detector" in caplog.text
+    status, _, err = run(capsys, "solve", dive_log, "-o", tmp_path / "none.mcap", "--detector", "none")
+    assert status == 2
+    assert "detector method 'none': choose one of source, paper" in err
+    assert not (tmp_path / "none.mcap").exists()
+
+
 def test_a_track_in_parts_says_for_how_long_it_tells():
     told = Tracked()
     for k in (0, 1, 2, 1000, 1001):
