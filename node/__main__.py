@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.options import above_zero
+from buddyline.protocol.options import CommandParser, above_zero
 from buddyline.protocol.service import start_logging
 
 
@@ -36,7 +36,9 @@ def run(args: argparse.Namespace) -> int:
 
 def main() -> int:
     """Run as a program of its own."""
-    parser = argparse.ArgumentParser(prog="node", description="One Buddyline node: capture, detect, publish, record.")
+    parser = CommandParser(
+        prog="python -m buddyline.node", description="One Buddyline node: capture, detect, publish, record."
+    )
     add_arguments(parser)
     start_logging()
     try:

@@ -1,13 +1,21 @@
-"""Numbers given on the command line, checked as argparse's `type`."""
+"""The command line: its errors are one line, and numbers are checked as argparse's `type`."""
 
 from __future__ import annotations
 
 import argparse
 import math
-from typing import Final
+from typing import Final, NoReturn
 
 # No option of ours asks for more: 126 years in s, of which ns still fit into 64 bits.
 MOST: Final = 4e9
+
+
+class CommandParser(argparse.ArgumentParser):
+    """A parser whose errors are one line: the option, what is wrong, and where to read more."""
+
+    def error(self, message: str) -> NoReturn:
+        """Say it on stderr, and end with status 2."""
+        self.exit(2, f"{self.prog}: {message}; see `{self.prog} --help`\n")
 
 
 def finite(text: str) -> float:

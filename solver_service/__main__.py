@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.options import above_zero
+from buddyline.protocol.options import CommandParser, above_zero
 from buddyline.protocol.service import start_logging
 
 
@@ -52,8 +52,9 @@ def run(args: argparse.Namespace) -> int:
 
 def main() -> int:
     """Run as a program of its own."""
-    parser = argparse.ArgumentParser(
-        prog="solver_service", description="Buddyline's solver: candidates of the nodes in, relative poses out."
+    parser = CommandParser(
+        prog="python -m buddyline.solver_service",
+        description="Buddyline's solver: candidates of the nodes in, relative poses out.",
     )
     add_arguments(parser)
     start_logging()

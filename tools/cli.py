@@ -15,6 +15,7 @@ from typing import Final
 
 from buddyline.protocol import __version__
 from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.options import CommandParser
 from buddyline.tools.losses import collected
 
 # What the system says where no more can be written, by no fault of the program.
@@ -42,7 +43,7 @@ class Command:
 
     def parser(self) -> argparse.ArgumentParser:
         """Return the command's parser."""
-        parser = argparse.ArgumentParser(
+        parser = CommandParser(
             prog=f"buddyline {self.name}",
             description=f"{self.does[0].upper()}{self.does[1:]}.",
             epilog="\n  ".join(["examples:", *(f"buddyline {example}" for example in self.examples)]),

@@ -132,6 +132,30 @@ def test_solve_asks_whether_logs_are_of_one_dive_where_nothing_else_explains_it(
     assert ("are the logs of the same dive?" in caplog.text) != two_rates
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["solve"], "buddyline solve: the following arguments are required: DIVE.mcap, -o/--output; see `bu"),
+        (["demo", "--nodes"], "buddyline demo: argument --nodes: expected one argument; see `buddyline demo --help`"),
+        (["demo", "more"], "buddyline demo: unrecognized arguments: more; see `buddyline demo --help`"),
+        (["demo", "--rate", "x"], "buddyline demo: argument --rate: x: give a number"),
+        (["export", "a.mcap", "--format", "foo"], "buddyline export: argument --format: invalid choice: 'foo'"),
+        (
+            ["survey", "tags", "x", "1", "-o", "t.pdf"],
+            "buddyline survey tags: argument first: invalid int value: 'x'; s",
+        ),
+    ],
+)
+def test_errors_of_usage_are_one_line(capsys, words, said):
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    err = capsys.readouterr().err
+    assert err.startswith(said)
+    assert err.endswith(" --help`\n")
+    assert err.count("\n") == 1
+
+
 def test_solve_names_a_detector_that_it_does_not_use(capsys, caplog, dive_log, tmp_path):
     run(capsys, "solve", dive_log, "-o", tmp_path / "out.mcap", "--detector", "paper")
     assert "its candidates are taken as they are: --detector" in caplog.text
