@@ -126,6 +126,16 @@ def test_site_people_and_instrument_are_on_it(dive: tuple[str, str]) -> None:
         assert text in page
 
 
+def test_a_report_of_a_dive_that_is_not_solved_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    raw, solved = write_log(tmp_path / "raw.mcap", *INFOS.values()), write_log(tmp_path / "solved.mcap", pose(0))
+    for log, warned in ((raw, True), (solved, False)):
+        caplog.clear()
+        assert main(["report", str(log), "-o", f"{log}.html"]) == 0
+        assert ("no poses in it, so that the report has none; solve it first" in caplog.text) == warned
+
+
 def test_an_unknown_line_of_what_it_says_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "about.toml").write_text('sight = "8 m"\n')
     log = write_log(tmp_path / "dive.mcap", *INFOS.values(), pose(0))
