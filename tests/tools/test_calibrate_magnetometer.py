@@ -170,3 +170,14 @@ def test_command_names_a_node_that_is_not_there(logged, tmp_path):
     log = logged(*turned_rig(n=300))
     with pytest.raises(BuddylineError, match="choose one with --node"):
         calibrate.run(arguments("magnetometer", log, "--node", "b"))
+
+
+@pytest.mark.parametrize(
+    ("words", "missing"),
+    [(("magnetometer",), "inertial samples"), (("gyroscope",), "inertial samples"), (("camera",), "pictures")],
+)
+def test_command_says_that_a_log_has_none_of_what_it_needs(tmp_path, words, missing):
+    with DiveLogWriter(tmp_path / "bare.mcap"):
+        pass
+    with pytest.raises(BuddylineError, match=rf"bare\.mcap: no {missing} of any node"):
+        calibrate.run(arguments(*words, str(tmp_path / "bare.mcap")))

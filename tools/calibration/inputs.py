@@ -67,7 +67,10 @@ def _one_node(dive: Dive, node: str | None, topic: str) -> str:
         return present[0]
     if node in present:
         return str(node)
-    raise BuddylineError(f"{dive.name}: {topic} of nodes {', '.join(present) or 'none'}; choose one with --node")
+    if not present:
+        what = {"image": "pictures", "imu": "inertial samples"}[topic]
+        raise BuddylineError(f"{dive.name}: no {what} of any node; name a node's own log, which has them")
+    raise BuddylineError(f"{dive.name}: {topic} of nodes {', '.join(present)}; choose one with --node")
 
 
 def places(
