@@ -12,6 +12,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
 
 if TYPE_CHECKING:
@@ -26,6 +27,8 @@ STILL_M: Final = 0.05
 STILL_RAD: Final = 0.03
 # The same of the origin's tilt, of which its own attitudes alone tell: they err by a degree and a half.
 STILL_TILT_RAD: Final = 0.06
+# Whether a node stands still is not to be seen in less; half a minute is advised.
+LEAST_S: Final = 1.0
 # Errors of the network's poses are correlated over about a second.
 INDEPENDENT_S: Final = 1.0
 RATE_HZ: Final = 10.0
@@ -98,15 +101,20 @@ def find(paths: Sequence[str], still: Sequence[str], net: str) -> dict[str, Stan
         for node in still:
             if node not in infos:
                 raise BuddylineError(f"{dive.name}: no NodeInfo of node {node}; nodes: {', '.join(sorted(infos))}")
-        attitudes, headings_rad, depths = [], [], []
+        attitudes, headings_rad, depths, stamps_ns = [], [], [], []
         for envelope in dive.messages("attitude", "depth"):
             if isinstance(envelope.message, Attitude) and envelope.message.node == origin:
                 attitudes.append(quat_to_matrix(np.array(envelope.message.q_ned_body_xyzw)))
                 headings_rad.append(envelope.message.sigma_rad[2])
+                stamps_ns.append(envelope.message.stamp_ns)
             elif isinstance(envelope.message, Depth) and envelope.message.node == origin:
                 depths.append(envelope.message.depth_m)
         if not attitudes:
             raise BuddylineError(f"{dive.name}: no attitude of node {origin}: its compass must say where north is")
+        if (told_s := (max(stamps_ns) - min(stamps_ns)) / S_NS) < LEAST_S:
+            raise BuddylineError(
+                f"{dive.name}: attitudes of node {origin} over {told_s:.1f} s only; record half a minute"
+            )
         _check_still(origin, np.array(attitudes), float(np.median(headings_rad)))
         R_body_camera = quat_to_matrix(np.array(infos[origin].q_body_camera_xyzw))
         R = _mean_rotation(np.array(attitudes)) @ R_body_camera
@@ -163,7 +171,7 @@ def _stand(node: str, poses: Sequence[NodePose], net: str) -> Stand:
     from buddyline.protocol.messages import FixedPlace
     from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix, rotation_log
 
-    if len(poses) < RATE_HZ:
+    if len(poses) < RATE_HZ * LEAST_S:
         raise BuddylineError(f"node {node}: the dive places it for {len(poses) / RATE_HZ:.1f} s only; is it seen?")
     p_m = np.array([pose.p_m for pose in poses])
     turns = quat_to_matrix(np.array([pose.q_xyzw for pose in poses]))

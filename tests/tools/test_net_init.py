@@ -79,6 +79,13 @@ def test_an_origin_that_swims_is_no_origin(dive, capsys):
     assert "node b: does not stand still: its tilt scatters by" in capsys.readouterr().err
 
 
+def test_seconds_that_show_no_stillness_give_no_origin(tmp_path, capsys):
+    path = tmp_path / "short.mcap"
+    assert main(["simulate", str(path), "--seconds", "0.5"]) == 0
+    assert main(["net", "init", str(path), "--still", "a"]) == 2
+    assert "attitudes of node a over 0.5 s only; record half a minute" in capsys.readouterr().err
+
+
 def test_an_origin_that_turns_on_its_tripod_is_no_origin():
     """By more than a compass's own noise, which a node that stands has, too."""
     rng = np.random.default_rng(3)
