@@ -63,6 +63,8 @@ def test_nothing_is_overwritten_and_nonsense_is_refused(tmp_path, capsys, monkey
 
 @pytest.mark.parametrize("words", [("node",), ("node", "--simulated"), ("hub",), ("solver",)])
 def test_marks_are_named_where_there_are_any(words, tmp_path, capsys):
-    path = tmp_path / "new.toml"
+    path = tmp_path / "my new.toml"
     assert main(["init", *words, "-o", str(path)]) == 0
-    assert ("what is marked with <-" in capsys.readouterr().out) == ("# <-" in path.read_text())
+    out = capsys.readouterr().out
+    assert ("what is marked with <-" in out) == ("# <-" in path.read_text())
+    assert f"next: buddyline {words[0]} --config '{path}'" in out

@@ -65,4 +65,6 @@ def test_a_file_is_never_overwritten(here, capsys):
 def test_it_is_written_where_it_is_wanted(here, capsys):
     assert main(["sample", "-o", "dive.mcap"]) == 0
     assert "buddyline solve dive.mcap" in capsys.readouterr().out
-    assert [path.name for path in here.iterdir()] == ["dive.mcap"]
+    assert main(["sample", "-o", "Höhle 1.mcap"]) == 0
+    assert "buddyline solve 'Höhle 1.mcap' -o" in capsys.readouterr().out
+    assert {path.name for path in here.iterdir()} == {"dive.mcap", "Höhle 1.mcap"}

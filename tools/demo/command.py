@@ -7,6 +7,7 @@ import json
 import logging
 import math
 import os
+import shlex
 import shutil
 import sys
 import tempfile
@@ -208,7 +209,7 @@ def _keep(logs: list[Path], truth: Iterable[tuple[int, str, Message]]) -> None:
     log.info(
         "demo: kept in %s: %s", records, ", ".join(path.name for path in (*logs, true, solved, report) if path.exists())
     )
-    log.info("demo: its errors: buddyline evaluate %s --truth %s", solved, true)
+    log.info("demo: its errors: buddyline evaluate %s", shlex.join(map(str, (solved, "--truth", true))))
 
 
 def _watch(service: Service, children: list[Child]) -> None:

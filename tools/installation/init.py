@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import shlex
 from importlib import resources
 from pathlib import Path
 from typing import Final
@@ -80,9 +81,10 @@ def run(args: argparse.Namespace) -> int:
     text = text_of(args.service, args.node, args.connect, simulated=args.simulated)
     write_new(path, text)
     marked = "; set what is marked with <-" if "<-" in text else ""
-    print(f"{path}: written{marked}\nnext: buddyline {args.service} --config {path}")
+    named = shlex.quote(str(path))
+    print(f"{path}: written{marked}\nnext: buddyline {args.service} --config {named}")
     if args.service == "node" and not args.simulated:
-        print(f"      buddyline doctor --config {path}      # says what is missing before a dive")
+        print(f"      buddyline doctor --config {named}      # says what is missing before a dive")
     return 0
 
 
