@@ -31,8 +31,10 @@ def again(dive: Dive, given: Sequence[str], nodes: Sequence[str]) -> list[Envelo
     for one in dive.all_of(IMU, Imu, doing="attitudes"):
         if one.node in nodes:
             samples[one.node].append(one)
-    for node in configs:
-        if node in nodes and node not in samples:
+    if not samples:
+        raise BuddylineError(f"{dive.name}: no inertial samples of any node, so no attitudes again; solve without that")
+    for node in nodes:
+        if node not in samples:
             log.warning("%s: no inertial samples of node %s: its attitudes stay as they are", dive.name, node)
     found: list[Envelope] = []
     for node, taken in samples.items():

@@ -285,6 +285,7 @@ def test_a_truncated_log_is_solved_as_far_as_it_goes(capsys, dive_log, tmp_path)
         (["--checks", "range,magic"], "magic"),
         (["--info", "a"], "NODE=FILE"),
         (["--info", "a=nothing.json"], "nothing.json"),
+        (["--attitude-again"], "no inertial samples of any node"),
         (["--nodes", "a", "c"], "node c"),
     ],
 )
