@@ -50,7 +50,9 @@ class Trust:
         if authority is not None:
             try:
                 self._authority = x509.load_pem_x509_certificate(Path(authority).read_bytes())
-            except (OSError, ValueError) as error:
+            except OSError as error:
+                raise SecurityError(f"{authority}: cannot be read: {error.strerror}") from error
+            except ValueError as error:
                 raise SecurityError(f"{authority}: is not a certificate in PEM: {error}") from error
 
     def refuses(self, node: str, certificate: str, signature: str, data: bytes) -> str:

@@ -44,6 +44,9 @@ def test_an_authority_that_is_none_is_named_first(tmp_path: Path, capfd: pytest.
     topside, own = (log_of(tmp_path / f"{name}.mcap", []) for name in ("top", "a"))
     words = ["backfill", topside, own, "-o", str(tmp_path / "x.mcap"), "--authority", str(tmp_path / "none.crt")]
     assert main(words) == 2
+    assert "none.crt: cannot be read: No such file or directory" in capfd.readouterr().err
+    (tmp_path / "none.crt").write_text("no certificate")
+    assert main(words) == 2
     assert "none.crt: is not a certificate in PEM" in capfd.readouterr().err
 
 
