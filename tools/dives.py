@@ -293,15 +293,16 @@ def _overlap(one: DiveLogReader, other: DiveLogReader) -> bool:
     return one.start_ns <= other.end_ns and other.start_ns <= one.end_ns
 
 
-def load_info(path: str) -> NodeInfo:
-    """Read a NodeInfo from a JSON file, or the first one of a dive log; raise an error naming the file."""
+def load_info(path: str, node: str | None = None) -> NodeInfo:
+    """Read a NodeInfo from a JSON file, or node's (default: the first one) of a log; raise an error naming the file."""
     file = Path(path)
     if file.suffix == ".mcap":
         with Dive([file]) as dive:
-            info = next(iter(dive.infos().values()), None)
-        if info is None:
-            raise ConfigError(f"{path}: holds no NodeInfo")
-        return info
+            infos = dive.infos()
+        if not infos or (node is not None and node not in infos):
+            of_node = f" of node {node}; it has {', '.join(infos) or 'none'}" if node is not None else ""
+            raise ConfigError(f"{path}: holds no NodeInfo{of_node}")
+        return infos[node or next(iter(infos))]
     try:
         return read_message(file, NodeInfo)
     except MessageError as error:

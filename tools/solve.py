@@ -161,7 +161,7 @@ def replacements(given: list[str]) -> dict[str, NodeInfo]:
     """Read the calibrations of `--info NODE=FILE`."""
     replaced = {}
     for node, path in node_files("--info", given):
-        info = load_info(path)
+        info = load_info(path, node)
         if info.node != node:
             raise ConfigError(f"--info {node}={path}: the file describes node {info.node}")
         replaced[node] = info

@@ -14,6 +14,7 @@ import pytest
 from buddyline.node.config import CalibrationConfig
 from buddyline.protocol.codec import decode, encode
 from buddyline.protocol.config import parse_config
+from buddyline.protocol.divelog import DiveLogWriter
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CameraModel, NodeInfo
 from buddyline.tools.calibration import camera
@@ -256,6 +257,20 @@ def test_command_writes_what_the_node_and_the_solver_take(folder, capsys):
     assert cv2.imread(str(picture)) is not None
     with pytest.raises(BuddylineError, match="exists"):
         calibrate._write_info(str(new), written)
+
+
+def test_command_changes_the_node_that_is_asked_for(folder):
+    """And none where a log of several nodes leaves it open: it took the first one's lights for all."""
+    log = folder / "log.mcap"
+    with DiveLogWriter(log) as writer:
+        for node in ("a", "b"):
+            writer.write_message(msgspec.structs.replace(info(), node=node))
+    new, pictures = folder / "new.json", [str(p) for p in sorted(folder.glob("*.png"))]
+    words = ["camera", *pictures, "--info", str(log), "--new-info", str(new), "--picture", str(folder / "p.jpg")]
+    with pytest.raises(BuddylineError, match="describes nodes a, b; choose one with --node"):
+        calibrate.run(arguments(*words))
+    assert calibrate.run(arguments(*words, "--node", "b")) == 0
+    assert decode(new.read_bytes(), NodeInfo).node == "b"
 
 
 @pytest.mark.parametrize(("folder", "poor"), [(0.1, False), (0.5, True)], indirect=["folder"])

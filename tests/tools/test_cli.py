@@ -285,14 +285,21 @@ def test_a_truncated_log_is_solved_as_far_as_it_goes(capsys, dive_log, tmp_path)
         (["--checks", "range,magic"], "magic"),
         (["--info", "a"], "NODE=FILE"),
         (["--info", "a=nothing.json"], "nothing.json"),
+        (["--info", "c=DIVE"], "holds no NodeInfo of node c; it has a, b"),
         (["--attitude-again"], "no inertial samples of any node"),
         (["--nodes", "a", "c"], "node c"),
     ],
 )
 def test_bad_arguments_name_the_value(capsys, dive_log, tmp_path, words, says):
-    status, _, err = run(capsys, "solve", dive_log, "-o", tmp_path / "out.mcap", *words)
+    given = [word.replace("DIVE", str(dive_log)) for word in words]
+    status, _, err = run(capsys, "solve", dive_log, "-o", tmp_path / "out.mcap", *given)
     assert status == 2
     assert says in err
+
+
+def test_a_log_of_several_nodes_describes_each(capsys, dive_log, tmp_path):
+    status, _, _ = run(capsys, "solve", dive_log, "-o", tmp_path / "out.mcap", "--info", f"b={dive_log}")
+    assert status == 0
 
 
 def test_a_configuration_typo_is_named(capsys, tmp_path):

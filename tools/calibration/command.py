@@ -156,11 +156,13 @@ def _camera(args: argparse.Namespace) -> None:
     from buddyline.tools.calibration.camera import GOOD_RMS_PX, CornerFinder, calibrate, distinct, draw
     from buddyline.tools.calibration.inputs import pictures
     from buddyline.tools.calibration.pictures import write_picture
-    from buddyline.tools.dives import load_info
     from msgspec.structs import replace
 
     if bool(args.info) != bool(args.new_info):
         raise BuddylineError("--info and --new-info go together")
+    info = _info_so_far(args.info, args.node) if args.info else None
+    if info is not None:
+        check_new(args.new_info)
     board = _the_board(args)
     finder = CornerFinder(board)
     seen = [finder.find(name, picture) for name, picture in pictures(args.pictures, args.node)]
@@ -168,6 +170,11 @@ def _camera(args: argparse.Namespace) -> None:
     if finder.size is None:
         raise BuddylineError(f"{', '.join(args.pictures)}: holds no pictures")
     width_px, height_px = finder.size
+    if info is not None and (info.width_px, info.height_px) != finder.size:
+        raise BuddylineError(
+            f"{args.info}: describes {info.width_px}x{info.height_px} pixels, the pictures have "
+            f"{width_px}x{height_px}: calibrate in the mode that dives"
+        )
     log.info("board found in %d of %d pictures", len(views), len(seen))
     found = calibrate(distinct(views, width_px), finder.size, board)
     write_picture(Path(args.picture), draw(found))
@@ -182,13 +189,7 @@ def _camera(args: argparse.Namespace) -> None:
             f"all views fit poorly: {found.rms_px:.2f} px, good ones stay below {GOOD_RMS_PX} px; take sharper "
             "pictures of a flat board, held still"
         )
-    if args.new_info:
-        info = load_info(args.info)
-        if (info.width_px, info.height_px) != found.size:
-            raise BuddylineError(
-                f"{args.info}: describes {info.width_px}x{info.height_px} pixels, the pictures have "
-                f"{width_px}x{height_px}: calibrate in the mode that dives"
-            )
+    if info is not None:
         _write_info(args.new_info, replace(info, camera=found.camera))
     camera = found.camera
     _print(
@@ -200,6 +201,21 @@ def _camera(args: argparse.Namespace) -> None:
             f"distortion = {_numbers(camera.distortion, '.6f')}",
         ]
     )
+
+
+def _info_so_far(path: str, node: str | None) -> NodeInfo:
+    """Return a node's NodeInfo from JSON or its log; raise BuddylineError where it is not clear which node's."""
+    from buddyline.tools.dives import Dive, load_info
+
+    if node is None and path.endswith(".mcap"):
+        with Dive([path]) as dive:
+            nodes = list(dive.infos())
+        if len(nodes) > 1:
+            raise BuddylineError(f"{path}: describes nodes {', '.join(nodes)}; choose one with --node")
+    info = load_info(path, node)
+    if node not in (None, info.node):
+        raise BuddylineError(f"{path}: describes node {info.node}, not {node}")
+    return info
 
 
 def _lights(args: argparse.Namespace) -> None:
