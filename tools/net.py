@@ -63,7 +63,7 @@ class Stand:
 
 def run(args: argparse.Namespace) -> int:
     """Find the places and print them; return 0."""
-    from buddyline.tools.newfile import new_folder
+    from buddyline.tools.newfile import new_folder, write_new
     from msgspec import to_builtins
 
     if args.output is not None:
@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     texts = {node: _toml(node, stand) for node, stand in stands.items()}
     if args.output is not None:
         for node, text in texts.items():
-            (args.output / f"{node}.toml").write_text(text)
+            write_new(args.output / f"{node}.toml", text)
             log.info("%s: append it to the configuration of node %s", args.output / f"{node}.toml", node)
     if args.json:
         print(json.dumps({node: to_builtins(one.place) for node, one in stands.items()}))

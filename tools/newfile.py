@@ -7,6 +7,7 @@ removed.
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -70,6 +71,21 @@ def write_new(path: Path | str, content: str | bytes, hint: str = REMOVE_IT) -> 
     """Write a new file; raise BuddylineError as new_file does."""
     with new_file(path, hint) as part:
         part.write_bytes(as_bytes(content))
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Replace a file, or the one that a link leads to, all at once; it keeps its permissions. Raise BuddylineError."""
+    target = path.resolve()
+    fresh = target.with_name(f"{target.name}.{os.getpid()}.new")
+    try:
+        fresh.write_bytes(text.encode())
+        shutil.copymode(target, fresh)
+        os.replace(fresh, target)
+    except OSError as error:
+        raise BuddylineError(f"{path}: cannot be written: {error.strerror}") from error
+    finally:
+        with suppress(OSError):
+            fresh.unlink(missing_ok=True)
 
 
 def write_output(target: str, content: str | bytes) -> None:

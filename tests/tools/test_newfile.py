@@ -7,7 +7,7 @@ import pytest
 from buddyline.protocol.divelog import DiveLogReader
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Depth
-from buddyline.tools.newfile import new_dive_log, new_file, new_folder, write_new
+from buddyline.tools.newfile import new_dive_log, new_file, new_folder, replace_text, write_new
 
 from tests.disks import small_disk
 
@@ -110,3 +110,14 @@ def test_a_name_that_is_not_utf_8_may_be_in_a_text_and_in_a_log_s_notes(tmp_path
         writer.write_message(DEPTH)
     with DiveLogReader(tmp_path / name) as reader:
         assert reader.metadata() == {"repaired_from": "caf?.mcap"}
+
+
+def test_a_text_is_replaced_whole_or_not_at_all(tmp_path):
+    with small_disk(tmp_path / "disk", 16) as disk:
+        kept = disk / "hub.toml"
+        kept.write_text("mine")
+        (disk / "full").write_bytes(bytes(8 << 10))
+        with pytest.raises(BuddylineError, match=r"hub\.toml: cannot be written: No space left"):
+            replace_text(kept, "x" * 9000)
+        assert kept.read_text() == "mine"
+        assert {path.name for path in disk.iterdir()} == {"hub.toml", "full"}

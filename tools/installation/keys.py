@@ -16,7 +16,7 @@ from buddyline.protocol.topics import check_node_id
 from buddyline.tools.arguments import subcommand
 from buddyline.tools.extras import needed
 from buddyline.tools.hub import load_hub_config
-from buddyline.tools.newfile import write_new
+from buddyline.tools.newfile import replace_text, write_new
 
 if TYPE_CHECKING:
     from buddyline.tools.installation.authority import Authority
@@ -177,7 +177,7 @@ def _admit(path: Path, node: str) -> None:
     """Add a node to the list in the hub's file, and change nothing else."""
     try:
         text = path.read_text(encoding="utf-8")
-    except OSError:
+    except (OSError, UnicodeDecodeError):
         text = ""
     line = _NODES_LINE.search(text)
     if line is None:
@@ -185,7 +185,7 @@ def _admit(path: Path, node: str) -> None:
         return
     nodes = [word for word in re.findall(r'"([^"]*)"', line.group(1)) if word != node] + [node]
     listed = ", ".join(f'"{word}"' for word in sorted(nodes))
-    path.write_text(f"{text[: line.start()]}nodes = [{listed}]{text[line.end() :]}", encoding="utf-8")
+    replace_text(path, f"{text[: line.start()]}nodes = [{listed}]{text[line.end() :]}")
     _say(f"{path}: node {node} may publish; a running hub takes that within seconds")
 
 

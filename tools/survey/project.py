@@ -10,7 +10,6 @@ import hashlib
 import json
 import os
 import re
-import shutil
 from collections.abc import Sequence
 from datetime import UTC, date, datetime
 from itertools import count
@@ -22,7 +21,7 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import Config, ConfigError, load_config
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NodeId, NonNegative, Positive
-from buddyline.tools.newfile import write_new
+from buddyline.tools.newfile import replace_text, write_new
 from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
 from msgspec import UNSET, Meta, UnsetType, field
 
@@ -426,20 +425,11 @@ def _ends_as(old: str, text: str) -> str:
 
 
 def _write_again(path: Path, text: str, old: str) -> None:
-    """Replace a file, or the one that a link leads to; it keeps its permissions. old: what to keep; "" for nothing."""
+    """Replace a project's text. old: what to keep; "" for nothing."""
     if old:
         numbered = (path.with_name(f"{path.name}.{number}") for number in count(1))
         write_new(next(kept for kept in numbered if not kept.exists()), old)
-    target = path.resolve()
-    fresh = target.with_name(f"{target.name}.{os.getpid()}.new")
-    try:
-        fresh.write_bytes(text.encode())
-        shutil.copymode(target, fresh)
-        os.replace(fresh, target)
-    except OSError as error:
-        raise BuddylineError(f"{path}: cannot be written: {error.strerror}") from error
-    finally:
-        fresh.unlink(missing_ok=True)
+    replace_text(path, text)
 
 
 def beside(path: Path, file: Path | str) -> str:
