@@ -27,10 +27,17 @@ REMOVE_IT: Final = "name another or remove it first"
 def check_new(path: Path | str, hint: str = REMOVE_IT) -> Path:
     """Return the path; raise BuddylineError if a file is there. Call it before the work whose result goes there."""
     # An empty name is this folder.
-    path = Path(path)
+    path = _named(path)
     if os.path.lexists(path):
         raise BuddylineError(f"{path}: exists; {hint}")
     return path
+
+
+def _named(path: Path | str) -> Path:
+    """Return the path; raise BuddylineError for `-`, which many programs take for standard output."""
+    if str(path) == "-":
+        raise BuddylineError("-: this does not go to standard output; name a file or folder")
+    return Path(path)
 
 
 @contextmanager
@@ -100,7 +107,7 @@ def write_output(target: str, content: str | bytes) -> None:
 
 def new_folder(path: Path | str) -> Path:
     """Make a folder for a command's output; raise BuddylineError if it exists and is not empty."""
-    folder = Path(path)
+    folder = _named(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):

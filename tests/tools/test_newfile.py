@@ -121,3 +121,11 @@ def test_a_text_is_replaced_whole_or_not_at_all(tmp_path):
             replace_text(kept, "x" * 9000)
         assert kept.read_text() == "mine"
         assert {path.name for path in disk.iterdir()} == {"hub.toml", "full"}
+
+
+@pytest.mark.parametrize("write", [new_folder, lambda path: write_new(path, "text")])
+def test_a_dash_is_no_name(tmp_path, monkeypatch, write):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(BuddylineError, match="-: this does not go to standard output; name a file"):
+        write("-")
+    assert list(tmp_path.iterdir()) == []
