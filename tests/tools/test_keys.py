@@ -237,6 +237,13 @@ def test_a_full_disk_leaves_no_empty_key(tmp_path, capsys):
         assert list((disk / "keys").iterdir()) == []
 
 
+@pytest.mark.parametrize("words", [("--directory", "mine", "init"), ("init", "--directory", "mine")])
+def test_options_may_stand_before_or_after_whose_keys_they_are_for(tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    assert main(["keys", *words]) == 0
+    assert (tmp_path / "mine" / "ca.crt").exists()
+
+
 def test_no_certificate_outlives_its_authority(tmp_path, capsys):
     words = ["keys", "--directory", str(tmp_path / "keys")]
     assert main([*words, "--days", "30", "init", "--hub", "127.0.0.1"]) == 0

@@ -47,13 +47,6 @@ _NODES_LINE: Final = re.compile(r"^nodes = \[(.*)\]$", re.MULTILINE)
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("--directory", default="keys", metavar="DIR", help="where all files are; default: %(default)s")
-    parser.add_argument(
-        "--days",
-        type=int,
-        metavar="N",
-        help=f"how long it is valid, no longer than the authority; default: {DAYS}, the authority 10 years",
-    )
     whose = parser.add_subparsers(
         dest="whose", required=True, metavar="|".join(("init", "node", *ROLES, "list", "renew"))
     )
@@ -73,6 +66,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     subcommand(whose, "list", "say who may do what, and until when", "keys list")
     renew = subcommand(whose, "renew", "make a certificate anew, and keep the old one beside it", "keys renew node-a")
     renew.add_argument("name", metavar="NAME", help="as `keys list` has it: hub, solver, viewer, node-a ...")
+    # Before or after the word that says whose: there an option that is not given changes nothing.
+    for one in (parser, *whose.choices.values()):
+        unset = None if one is parser else argparse.SUPPRESS
+        one.add_argument(
+            "--directory", default=unset or "keys", metavar="DIR", help="where all files are; default: keys"
+        )
+        one.add_argument(
+            "--days",
+            type=int,
+            default=unset,
+            metavar="N",
+            help=f"how long it is valid, no longer than the authority; default: {DAYS}, the authority 10 years",
+        )
 
 
 def run(args: argparse.Namespace) -> int:
