@@ -16,7 +16,7 @@ import msgspec
 from buddyline.node.detect import Detection, make_detector
 from buddyline.node.detect.masks import Corners
 from buddyline.node.devices import Frame
-from buddyline.node.drivers.stored import PICTURE_SUFFIXES, PictureError, decode_picture, picture_files
+from buddyline.node.drivers.stored import PICTURE_SUFFIXES, PictureError, decode_picture, picture_files, read_picture
 from buddyline.node.pipeline import Pipeline
 from buddyline.protocol.codec import encode
 from buddyline.protocol.envelope import Envelope, envelope_of
@@ -146,8 +146,8 @@ def _detect_pictures(args: argparse.Namespace) -> int:
         for i, file in enumerate(files):
             progress.show(i, file.name)
             try:
-                picture = decode_picture(file.read_bytes(), str(file))
-            except (PictureError, OSError) as error:
+                picture = read_picture(file)
+            except PictureError as error:
                 skipped += 1
                 losses.report([str(error)])
                 continue

@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.divelog import DiveLogReader
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.parity import restore
 from buddyline.tools import losses
 from buddyline.tools.newfile import new_dive_log
@@ -51,13 +52,20 @@ def healed(path: Path, beside: Path) -> Iterator[Path]:
 
     The copy is beside another path while it is used.
     """
-    patches, lost = restore(path) if path.is_file() and path.stat().st_size else ({}, 0)
+    try:
+        patches, lost = restore(path) if path.is_file() and path.stat().st_size else ({}, 0)
+    except OSError as error:
+        raise BuddylineError(f"{path}: cannot be read: {error.strerror}") from error
     if lost:
         print(f"{path}: {lost} damaged blocks are more than their parity restores", file=sys.stderr)
     if not patches:
         yield path
         return
-    with tempfile.NamedTemporaryFile(dir=beside.parent, prefix=f"{beside.name}.", suffix=".part") as copy:
+    try:
+        part = tempfile.NamedTemporaryFile(dir=beside.parent, prefix=f"{beside.name}.", suffix=".part")
+    except OSError as error:
+        raise BuddylineError(f"{beside}: cannot be written: {error.strerror}") from error
+    with part as copy:
         with open(path, "rb") as damaged:
             shutil.copyfileobj(damaged, copy)
         for offset, block in patches.items():

@@ -68,13 +68,25 @@ def decode_picture(data: bytes, name: str) -> NDArray[np.uint8]:
     return np.ascontiguousarray(picture, np.uint8)
 
 
+def read_picture(path: Path) -> NDArray[np.uint8]:
+    """Return the picture of a file, as decode_picture does; raise PictureError naming the file."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise PictureError(f"{path}: cannot be read: {error.strerror}") from error
+    return decode_picture(data, str(path))
+
+
 def picture_files(path: Path) -> list[Path]:
     """Return the pictures of a folder, or a single one, by name; raise PictureError where there is neither."""
-    if not path.exists():
-        raise PictureError(f"{path}: no such picture, folder or dive log")
-    if path.is_dir():
-        return sorted(p for p in path.iterdir() if p.suffix.lower() in PICTURE_SUFFIXES)
-    return [path]
+    try:
+        if path.is_dir():
+            return sorted(p for p in path.iterdir() if p.suffix.lower() in PICTURE_SUFFIXES)
+        if path.exists():
+            return [path]
+    except OSError as error:
+        raise PictureError(f"{path}: cannot be read: {error.strerror}") from error
+    raise PictureError(f"{path}: no such picture, folder or dive log")
 
 
 class FolderCamera:
@@ -99,8 +111,8 @@ class FolderCamera:
         """Wait for the next trigger instant and return the next undamaged picture."""
         for file in self._files:
             try:
-                picture = decode_picture(file.read_bytes(), str(file))
-            except (BuddylineError, OSError) as error:
+                picture = read_picture(file)
+            except PictureError as error:
                 self.skipped["unreadable"] += 1
                 log.warning("skipped: %s", error)
                 continue

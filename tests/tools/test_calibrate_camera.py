@@ -296,6 +296,9 @@ def test_command_refuses_a_calibration_of_another_resolution(folder):
 def test_command_names_what_is_not_there(tmp_path):
     with pytest.raises(BuddylineError, match="no such picture"):
         calibrate.run(arguments("camera", str(tmp_path / "none")))
+    (tmp_path / "unreadable.png").mkdir()
+    with pytest.raises(BuddylineError, match=r"unreadable\.png: cannot be read: Is a directory"):
+        calibrate.run(arguments("camera", str(tmp_path)))
     (tmp_path / "empty").mkdir()
     with pytest.raises(BuddylineError, match="holds no pictures"):
         calibrate.run(arguments("camera", str(tmp_path / "empty")))

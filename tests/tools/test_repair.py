@@ -133,3 +133,22 @@ def test_missing_sequence_numbers_are_not_interpreted():
     assert missing(np.zeros(5, np.int64), np.arange(5)) == []
     assert missing(np.empty(0, np.int64), np.empty(0, np.int64)) == []
     assert missing(np.arange(5)[::-1].copy(), np.arange(5)) == []
+
+
+def test_files_that_cannot_be_read_or_written_are_one_line(tmp_path, capsys, monkeypatch):
+    path = tmp_path / "in.mcap"
+    with DiveLogWriter(path) as writer:
+        for i in range(COUNT):
+            writer.write_message(Depth(node="a", stamp_ns=i * TICK_NS, depth_m=float(i), sigma_m=0.02))
+    data = bytearray(path.read_bytes())
+    data[len(data) // 4] ^= 255
+    path.write_bytes(data)
+    assert main(["repair", str(path), "-o", str(tmp_path / "none" / "out.mcap")]) == 2
+    assert capsys.readouterr().err.endswith("out.mcap: cannot be written: No such file or directory\n")
+
+    def refuse(path):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("buddyline.tools.repair.restore", refuse)
+    assert main(["repair", str(path), "-o", str(tmp_path / "out.mcap")]) == 2
+    assert capsys.readouterr().err == f"buddyline repair: {path}: cannot be read: Permission denied\n"

@@ -31,7 +31,7 @@ from buddyline.node.config import ExposureConfig
 from buddyline.node.detect import make_detector
 from buddyline.node.detect.detection import LIKELY
 from buddyline.node.devices import Frame
-from buddyline.node.drivers.stored import decode_picture, picture_files
+from buddyline.node.drivers.stored import picture_files, read_picture
 from buddyline.node.guide import Guide
 from buddyline.node.pipeline import Pipeline
 from buddyline.protocol.clock import S_NS, trigger_index
@@ -148,7 +148,7 @@ def without_lamps(folder: Path) -> dict[str, Any]:
     """Return the row of a folder with pictures that show no lamp, each seen by a detector of its own."""
     seen = SeenLights()
     for file in (file for place in sorted({folder, *folder.rglob("*/")}) for file in picture_files(place)):
-        blobs = [d.blob for d in make_detector().detect(decode_picture(file.read_bytes(), str(file)))]
+        blobs = [d.blob for d in make_detector().detect(read_picture(file))]
         seen.add(blobs, [], [False] * len(blobs))
     return {"folder": str(folder), **_of_candidates(seen)}
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from buddyline.node.drivers.stored import decode_picture, picture_files
+from buddyline.node.drivers.stored import decode_picture, picture_files, read_picture
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Candidates, CompressedImage, Imu, NodeInfo, RelativePose
@@ -31,7 +31,7 @@ def pictures(paths: list[str], node: str | None) -> Iterator[tuple[str, NDArray[
             yield from _dive_pictures(path, node)
             continue
         for file in picture_files(path):
-            yield str(file), decode_picture(file.read_bytes(), str(file))
+            yield str(file), read_picture(file)
 
 
 def _dive_pictures(path: Path, node: str | None) -> Iterator[tuple[str, NDArray[np.uint8]]]:

@@ -24,7 +24,7 @@ import numpy as np
 from buddyline.node.detect import Detector, make_detector, values_of
 from buddyline.node.detect.detection import focal_of, is_likely
 from buddyline.node.detect.source import SourceDetector
-from buddyline.node.drivers.stored import PictureError, decode_picture, picture_files
+from buddyline.node.drivers.stored import PictureError, decode_picture, picture_files, read_picture
 from buddyline.protocol.clock import trigger_index
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CompressedImage, LightTruth
@@ -263,8 +263,8 @@ def _readable(files: Iterable[Path]) -> Iterator[tuple[Path, NDArray[np.uint8]]]
     """Yield the pictures that can be read; report the others as losses."""
     for file in files:
         try:
-            yield file, decode_picture(file.read_bytes(), str(file))
-        except (PictureError, OSError) as error:
+            yield file, read_picture(file)
+        except PictureError as error:
             losses.report([str(error)])
 
 
