@@ -26,7 +26,7 @@ _MIN_COMPARED: Final = 10
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, print, and draw where asked for; return 1 where truth and results are hardly of one dive, else 0."""
+    """Measure, print, and draw where asked for; return 0."""
     if args.plots is not None:
         figures.check()
         new_folder(args.plots)
@@ -46,7 +46,8 @@ def run(args: argparse.Namespace) -> int:
         for path in write_figures(result, args.plots):
             log.info("%s", path)
     compared = [(result.accuracy.wrong, result.accuracy.poses), *((one.wrong, one.samples) for one in result.tracks)]
-    return _tell_of_two_dives(args, compared)
+    _tell_of_two_dives(args, compared)
+    return 0
 
 
 def _evaluate_network(args: argparse.Namespace) -> int:
@@ -54,7 +55,8 @@ def _evaluate_network(args: argparse.Namespace) -> int:
         raise BuddylineError("--plots and --pair: of a pair, not of a net")
     figures = network_figures(*load_network(args.logs, args.truth))
     print(json.dumps({"network": [asdict(one) for one in figures]}) if args.json else network_text(figures))
-    return _tell_of_two_dives(args, [(one.wrong, one.samples) for one in figures if not one.fixed])
+    _tell_of_two_dives(args, [(one.wrong, one.samples) for one in figures if not one.fixed])
+    return 0
 
 
 def _of_truth(args: argparse.Namespace) -> str:
@@ -63,18 +65,16 @@ def _of_truth(args: argparse.Namespace) -> str:
     return f" in {others}" if others else ""
 
 
-def _tell_of_two_dives(args: argparse.Namespace, compared: Iterable[tuple[int, int]]) -> int:
-    """Say where most of what was compared (wrong, of how many) is wrong by a truth of another log; return the status.
+def _tell_of_two_dives(args: argparse.Namespace, compared: Iterable[tuple[int, int]]) -> None:
+    """Say where most of what was compared (wrong, of how many) is wrong by a truth of another log.
 
     The figures stand: only poses may tell two dives of one time apart, and all poses of a dive may be wrong.
     """
     of_truth = _of_truth(args)
     contradicted = next(((wrong, n) for wrong, n in compared if n >= _MIN_COMPARED and wrong > n / 2), None)
-    if not of_truth or contradicted is None:
-        return 0
-    log.warning(
-        "%s: %d of %d poses or rows are wrong by the truth%s: it seems to be of another dive; name the log of this "
-        "dive's truth with --truth T.mcap. If it is of this dive, look for clocks, bars or calibrations that are wrong",
-        *(args.logs[0], *contradicted, of_truth),
-    )
-    return 1
+    if of_truth and contradicted is not None:
+        log.warning(
+            "%s: %d of %d poses or rows are wrong by the truth%s: it seems to be of another dive; name the log of this "
+            "dive's truth with --truth T.mcap. If it is of this dive, look for wrong clocks, bars or calibrations",
+            *(args.logs[0], *contradicted, of_truth),
+        )
