@@ -268,7 +268,8 @@ class SolverCore:
         if self.network is None:
             return messages
         self.network.one_in = self.pace.one_in
-        return messages + self.network.take(newer(messages, told_ns))
+        outcomes = [outcome for _, one in settled for outcome in one.outcomes]
+        return messages + self.network.take(newer(outcomes, told_ns))
 
     def _steady(self, receive_ns: int | None) -> int | None:
         """Return the receive time on a clock that never goes back, so that a clock set back prolongs no waiting."""

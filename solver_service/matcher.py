@@ -256,13 +256,16 @@ class PairMatcher:
         """Return whether a frame calls for an outcome of its trigger, and whether the other node's frame still may.
 
         A trigger that has its outcome gets another one if a node that had a frame in it reaches the trigger again on a
-        new time line. The frame of a node that had none, and is on a new time line too, waits for that one.
+        new time line. The frame of a node that had none waits for that one: the other's clock was ahead for a while.
         """
         resolved = self._resolved.get(trigger)
         if resolved is None:
             return True, True
-        anew = [now > then for now, then in zip(self._time_lines, resolved.time_lines, strict=True)]
-        return anew[side] and resolved.had_frame[side], all(anew)
+        again = [
+            now > then and had
+            for now, then, had in zip(self._time_lines, resolved.time_lines, resolved.had_frame, strict=True)
+        ]
+        return again[side], any(again)
 
     def _give_up(self, frame: Candidates, reason: Reason, detail: str, *, ahead: int = 0) -> list[Matched | Unmatched]:
         """End a trigger without a match; ahead: 1 if the frame may be the first of a new time line."""

@@ -47,8 +47,12 @@ def newer(messages: list[Message], told_ns: int) -> list[Message]:
 
 @dataclass(frozen=True, eq=False)
 class Settled:
-    """Outcomes of a pair, in the order of its triggers, and what its track is about to tell."""
+    """Outcomes of a pair, in the order of its triggers, and what its track is about to tell.
 
+    past: outcomes of before a clock was set: they are told, and carry neither track nor network on.
+    """
+
+    past: list[Message] = field(default_factory=list)
     outcomes: list[Message] = field(default_factory=list)
     track: Coming = field(default_factory=Coming)
 
@@ -85,6 +89,7 @@ class PairCore:
         self._alone = True
         self._unsettled: list[Matched | Unmatched] = []
         self._settled: list[Message] = []
+        self._past: list[Message] = []
         self._advised: list[str] = []
 
     def crowd(self, *, alone: bool, crowded: bool, one_in: int) -> None:
@@ -99,6 +104,8 @@ class PairCore:
         if arrival is Arrival.CLOCK_SET:
             self._unsettled += self.matcher.restart(frame.node)
             self._solve()
+            self._past += self._settled
+            self._settled = []
             self.solver.forget()
             self._posed_ns = self._last = None
             self._why.clear()
@@ -113,7 +120,7 @@ class PairCore:
     @property
     def has_news(self) -> bool:
         """Whether there are triggers to settle."""
-        return bool(self._unsettled or self._settled)
+        return bool(self._unsettled or self._settled or self._past)
 
     def settle(self, told_ns: int = -1) -> list[Message]:
         """Solve all matched triggers at once; return the outcomes in the order of the triggers, then the track.
@@ -128,12 +135,13 @@ class PairCore:
             return Settled()
         self._solve()
         settled, self._settled = self._settled, []
+        past, self._past = self._past, []
         track = self.tracker.follow(newer(settled, told_ns)) if self.tracker is not None else Coming()
-        return Settled(settled, track)
+        return Settled(past, settled, track)
 
     def tell(self, settled: Settled) -> list[Message]:
         """Return the outcomes, then the track's messages."""
-        told = settled.outcomes + (self.tracker.tell(settled.track) if self.tracker is not None else [])
+        told = settled.past + settled.outcomes + (self.tracker.tell(settled.track) if self.tracker is not None else [])
         for message in told:
             if isinstance(message, RelativePose):
                 self._posed_ns = message.stamp_ns

@@ -79,8 +79,7 @@ class SampleStream(Generic[S]):
         if verdict == "drop":
             return
         if verdict == "restart":
-            self._stamps.clear()
-            self._samples.clear()
+            self.clear()
         at = bisect.bisect_left(self._stamps, sample.stamp_ns)
         if at < len(self._stamps) and self._stamps[at] == sample.stamp_ns:
             return
@@ -89,6 +88,11 @@ class SampleStream(Generic[S]):
         if len(self._stamps) > MAX_SAMPLES or self._stamps[0] < self._stamps[-1] - 2 * KEPT_NS:
             keep = max(bisect.bisect_left(self._stamps, self._stamps[-1] - KEPT_NS), len(self._stamps) - MAX_SAMPLES)
             del self._stamps[:keep], self._samples[:keep]
+
+    def clear(self) -> None:
+        """Drop all samples: the clock was set back."""
+        self._stamps.clear()
+        self._samples.clear()
 
     def around(self, stamp_ns: int) -> tuple[S | None, S | None]:
         """Return the last sample at or before stamp_ns, and the first after it; None where there is none."""
@@ -131,7 +135,7 @@ class ImuWindow:
         if verdict == "drop":
             return
         if verdict == "restart":
-            self._start = self._end = 0
+            self.clear()
         if self._end == len(self._stamps):
             self._stamps[: len(self)] = self._stamps[self._start : self._end].copy()
             self._values[: len(self)] = self._values[self._start : self._end].copy()
@@ -149,6 +153,10 @@ class ImuWindow:
         oldest_ns = self._stamps[self._end - 1] - KEPT_NS
         while self._stamps[self._start] < oldest_ns or len(self) > MAX_SAMPLES:
             self._start += 1
+
+    def clear(self) -> None:
+        """Drop all samples: the clock was set back."""
+        self._start = self._end = 0
 
     def between(self, start_ns: int, end_ns: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the samples from start_ns to end_ns, both included: stamps (N,), and (N, 6) m/s^2 and rad/s."""

@@ -252,6 +252,8 @@ class NodeStream:
         self.frames.clear()
         self._sequence.clear()
         self._newest_trigger = -1
+        for sensor in (self.imu, self.attitude, self.depth):
+            sensor.clear()
         return Arrival.CLOCK_SET
 
     def _count_missing(self, receive_ns: int | None) -> None:

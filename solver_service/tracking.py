@@ -111,9 +111,7 @@ class PairTracker:
         self._filter: TrackFilter | None = None
         self.crowded, self.one_in, self._stopped = False, 1, False
         self._past: list[str] = []
-        # Inertial samples that came too late, and each node's newest trigger when its last one did.
-        self.late_imu = 0
-        self._late_ns: dict[str, int] = {}
+        self.late_imu = 0  # inertial samples that came too late
         self._made = False
         self._streams = stream_a, stream_b
         self._settings = settings
@@ -130,10 +128,13 @@ class PairTracker:
         self._lag: TrackLag | None = None
         self._pieces: tuple[list[NodeRecord], list[NodeRecord]] = ([], [])
         self._fixes: list[FixSeen] = []
+        self._asked_ns: list[int] = []
         self._first_ns: int | None = None
         self._taken_ns = -1
         self._told_ns = -1
         self._settled_ns = -1
+        # Of nodes with such samples, the newest outcome when the last one came.
+        self._late_ns: dict[str, int] = {}
         self._oriented = self._idle = False
         self._fixed_ns = -REST_NS
         self._clock: tuple[float, float] | None = None
@@ -339,7 +340,8 @@ class PairTracker:
                     messages += self._messages(self._lag.finish(), "lag")
                 if not all(self._pieces):
                     return messages
-                found = smooth(self._recorded(), self._fixes, self._due(self._first_ns or 0, end_ns))
+                asked_ns, self._asked_ns = self._asked_ns, []
+                found = smooth(self._recorded(), self._fixes, asked_ns)
             except NUMERIC_ERRORS as error:
                 self._start_anew(str(error))
                 return []
@@ -377,6 +379,8 @@ class PairTracker:
                 self._pieces[node].append(piece)
             if self._filter is not None:
                 feed(self._filter, node, piece)
+        if "smooth" in self._settings.modes:
+            self._asked_ns += self._due(max(self._taken_ns + 1, self._first_ns or 0), to_ns)
         self._taken_ns = to_ns
         self._unseen = {trigger: ns for trigger, ns in self._unseen.items() if ns > to_ns - S_NS}
         return self._live(to_ns)
@@ -440,9 +444,12 @@ class PairTracker:
         ]
 
     def _due(self, start_ns: int, end_ns: int) -> list[int]:
-        """Return the instants of the rows from start_ns to end_ns."""
+        """Return the instants of the rows from start_ns to end_ns, of a longer gap those of its beginning.
+
+        After that nothing is known, and where clocks are weeks apart, the instants in between would fill the memory.
+        """
         first = -(-start_ns // self._period_ns)
-        rows = range(first, end_ns // self._period_ns + 1)
+        rows = range(first, min(end_ns, start_ns + KEPT_NS) // self._period_ns + 1)
         return [k * self._period_ns for k in rows if not k % self.one_in]
 
     def _piece(self, stream: NodeStream, node: int, start_ns: int, end_ns: int) -> NodeRecord:

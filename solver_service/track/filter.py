@@ -84,6 +84,8 @@ FAR_SIGMAS: Final = 6.0
 BRIDGED_S: Final = 1.0
 # The last row stands for the present where it is at most this much before it.
 LITTLE_S: Final = 0.01
+# A step over a longer gap leaves nothing that is known, and one over hours takes minutes.
+LONGEST_GAP_S: Final = 60.0
 # Of one time, a row comes after the fixes (0) and the pictures of both nodes (1 and 2).
 ROW_RANK: Final = 3
 # Messages older than this are dropped. The noise of slow sensors is learned from so much.
@@ -125,6 +127,7 @@ class TrackFilter(TrackPool):
             self._push(self.pair_seconds(stamp_ns), ROW_RANK, stamp_ns)
         while self._events and self._events[0][0] <= end_s:
             t_s, _, _, what = heapq.heappop(self._events)
+            self._end_behind(t_s - LONGEST_GAP_S)
             if isinstance(what, int):
                 row = self._row(t_s, what)
                 if row is not None:
@@ -348,10 +351,8 @@ class TrackFilter(TrackPool):
             sigma_m = math.sqrt(float(np.trace(place_covariance(main.state, main.covariance))))
             if sigma_m > LOST_SHARE * min(range_m, LOST_RANGE_M):
                 # It knows no more than a new start would.
-                main.end_s = main.light_s + 1.0
-                main.steps.drop_after(main.end_s)
-                self.finished.append(main)
-                self.main = main = None
+                self._lose(main)
+                main = None
         if main is not None and main.confirmed:
             for challenger in self.challengers:
                 gained = main.evidence - challenger.baseline
@@ -396,6 +397,22 @@ class TrackFilter(TrackPool):
         # Others are replayed, which tells which lamps are dark.
         for node, t_s, seen in estimate.seen_history if estimate.lone else ():
             self.lamps.take(node, t_s, seen)
+
+    def _lose(self, main: Estimate) -> None:
+        """End the track a second after its last light."""
+        main.end_s = main.light_s + 1.0
+        main.steps.drop_after(main.end_s)
+        self.finished.append(main)
+        self.main = None
+
+    def _end_behind(self, since_s: float) -> None:
+        """End all estimates that have not been carried on since then."""
+        if self.main is not None and self.main.t_s < since_s:
+            if self.main.confirmed:
+                self._lose(self.main)
+            self.main = None
+        if self.challengers:
+            self.challengers = [one for one in self.challengers if one.t_s >= since_s]
 
     @staticmethod
     def _thinned(t_s: float, pool: list[Estimate]) -> list[Estimate]:
