@@ -18,6 +18,7 @@ from buddyline.solver_service.network.filter import NetFilter
 from buddyline.solver_service.network.rows import NetRow
 from buddyline.solver_service.pace import NO_NETWORK
 from buddyline.solver_service.results import NUMERIC_ERRORS, view_of, wrong_size
+from buddyline.solver_service.sensors import KEPT_NS
 from buddyline.solver_service.streams import STOPPED_NS, NodeStream
 from buddyline.solver_service.track.inputs import DepthSeen
 from buddyline.solver_service.track.problems import as_ended, merged
@@ -100,16 +101,21 @@ class NetTracker:
 
     def take(self, outcomes: Iterable[Message]) -> list[Message]:
         """Go on to where these outcomes allow; return the poses of all nodes up to there."""
-        outcomes, fixes = list(outcomes), []
+        outcomes = list(outcomes)
+        fixes: list[RelativePose] = []
         if not outcomes or self._stopped:
             return self._with_left([])
         for one in outcomes:
-            # A late frame's stamp is old, or far from the dive's time: it does not carry the network on.
-            if isinstance(one, RelativePose) or (isinstance(one, Rejected) and one.reason != "late"):
-                pair = one.node_a, one.node_b
-                self._settled_ns[pair] = max(self._settled_ns.get(pair, 0), one.stamp_ns)
-                # However many outcomes come at once, the network begins with the first of them.
-                self._first_ns = one.stamp_ns if self._first_ns is None else min(self._first_ns, one.stamp_ns)
+            if not (isinstance(one, RelativePose | Rejected) and self._carries(one)):
+                continue
+            if self._settled_ns and one.stamp_ns > max(self._settled_ns.values()) + KEPT_NS:
+                # After such a gap nothing of before helps, and a step over hours takes minutes.
+                self.forget()
+                fixes.clear()
+            pair = one.node_a, one.node_b
+            self._settled_ns[pair] = max(self._settled_ns.get(pair, 0), one.stamp_ns)
+            # However many outcomes come at once, the network begins with the first of them.
+            self._first_ns = one.stamp_ns if self._first_ns is None else min(self._first_ns, one.stamp_ns)
             if isinstance(one, RelativePose):
                 fixes.append(one)
         with np.errstate(all="ignore"):
@@ -117,6 +123,20 @@ class NetTracker:
                 return self._take(fixes, self._frontier_ns())
             except NUMERIC_ERRORS as error:
                 return self._started_anew(str(error))
+
+    def _carries(self, outcome: RelativePose | Rejected) -> bool:
+        """Whether an outcome carries the network on.
+
+        A late frame's stamp is old, or far from the dive's time. A single frame does not tell whether its node's clock
+        is right: where it is ahead of all that was settled, the others' data would come too late.
+        """
+        is_single = isinstance(outcome, Rejected) and outcome.reason in ("unmatched", "duplicate")
+        if isinstance(outcome, Rejected) and outcome.reason == "late":
+            return False
+        if not self._settled_ns:
+            return not is_single
+        ahead_ns = outcome.stamp_ns - max(self._settled_ns.values())
+        return ahead_ns >= -KEPT_NS and not (is_single and ahead_ns > STOPPED_NS)
 
     def finish(self) -> list[Message]:
         """Take what is left, at the end of the dive."""

@@ -3,10 +3,14 @@
 import tracemalloc
 
 import pytest
+from buddyline.node.sim import dive as simulation
+from buddyline.node.sim.scenario import DivePlan, Scenario
+from buddyline.node.sim.world import World
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.messages import Candidates, NodeInfo, Rejected, RelativePose, Track
+from buddyline.protocol.messages import Candidates, NodeInfo, NodePose, Rejected, RelativePose, Track
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.trigger import Settings
+from buddyline.solver_service.network.estimate import NetEstimate
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.tracking import TrackSettings
 from msgspec.structs import replace
@@ -20,6 +24,16 @@ DAY_S = 86_400
 @pytest.fixture(scope="module")
 def inertial():
     return dive_messages(seconds=9.0, imu=True)[0]
+
+
+@pytest.fixture(scope="module")
+def three():
+    scenario = Scenario(
+        seed=5, start_ns=START_NS, environment="basin", node_a="a", node_b="b", more_nodes=("c",), interruptions=False
+    )
+    told = [one for _, _, one in simulation.messages(World(scenario), DivePlan(seconds=6.0, imu=True))]
+    kept = [one for one in told if hasattr(one, "node") and not isinstance(one, NodePose)]
+    return sorted(kept, key=lambda one: (one.stamp_ns, isinstance(one, Candidates)))
 
 
 def ahead(message, by_s):
@@ -99,3 +113,28 @@ def test_a_track_does_not_walk_through_a_gap_of_an_hour(inertial, mode, monkeypa
     assert steps.count > 30
     assert sum(at_s < 4 for at_s in rows_s) > 30
     assert sum(at_s > gap_s for at_s in rows_s) > 30
+
+
+@pytest.mark.parametrize("by_s", [4, 60, DAY_S])
+def test_a_network_goes_on_while_one_nodes_clock_is_ahead(three, by_s, monkeypatch):
+    """Rows of its time would be of the future, and the other nodes' data would come too late for them."""
+    StepCount(monkeypatch, NetEstimate, "_go")
+    found, _ = live(three, "c", by_s, 2.0)
+    rows = [(at_s, one) for at_s, one in found if isinstance(one, NodePose)]
+    assert all(one.stamp_ns < START_NS + at_s * S_NS for at_s, one in rows)
+    for node in "ab":
+        assert sum(one.node == node and at_s > 4.0 for at_s, one in rows) > 25
+
+
+def test_a_network_does_not_walk_through_a_gap_of_an_hour(three, monkeypatch):
+    steps = StepCount(monkeypatch, NetEstimate, "_go")
+    core = SolverCore(Settings(), None, track=TrackSettings(frozenset(("filter",)), 20.0))
+    gap_s = 3600
+    messages = [one if one.stamp_ns < START_NS + 3 * S_NS else ahead(one, gap_s) for one in three]
+    found = [result for one in messages for result in core.handle(one)] + core.flush()
+    rows = [one for one in found if isinstance(one, NodePose)]
+    assert steps.count > 10
+    for node in "abc":
+        of_node_s = [(one.stamp_ns - START_NS) / S_NS for one in rows if one.node == node]
+        assert sum(at_s < 4 for at_s in of_node_s) > 20
+        assert sum(at_s > gap_s for at_s in of_node_s) > 20
