@@ -323,8 +323,8 @@ class SolverCore:
                 pair.take(message, arrival, now_ns, live=live)
         else:
             for sample in message.samples() if isinstance(message, ImuMeans) else (message,):
-                stream.add_sample(sample)
-                if isinstance(sample, Imu):
+                # One that was here in time may come again later.
+                if stream.add_sample(sample) and isinstance(sample, Imu):
                     self._note_late(sample)
         if isinstance(message, Imu | ImuMeans):
             return ()  # No trigger waits for inertial samples.

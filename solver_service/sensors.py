@@ -128,12 +128,12 @@ class ImuWindow:
         """Stamp of the newest sample; None if there is none."""
         return int(self._stamps[self._end - 1]) if len(self) else None
 
-    def add(self, sample: Imu) -> None:
-        """Take one sample; samples may come in any order."""
+    def add(self, sample: Imu) -> bool:
+        """Take one sample; samples may come in any order. Return False for one that came before."""
         newest_ns = self.newest_ns
         verdict = self._jump.judge(sample.stamp_ns, newest_ns)
         if verdict == "drop":
-            return
+            return True
         if verdict == "restart":
             self.clear()
         if self._end == len(self._stamps):
@@ -144,7 +144,7 @@ class ImuWindow:
         if newest_ns is not None and verdict == "take" and sample.stamp_ns <= newest_ns:
             at = self._place(sample.stamp_ns)
             if self._stamps[at] == sample.stamp_ns:
-                return
+                return False
             self._stamps[at + 1 : self._end + 1] = self._stamps[at : self._end].copy()
             self._values[at + 1 : self._end + 1] = self._values[at : self._end].copy()
         self._stamps[at] = sample.stamp_ns
@@ -153,6 +153,7 @@ class ImuWindow:
         oldest_ns = self._stamps[self._end - 1] - KEPT_NS
         while self._stamps[self._start] < oldest_ns or len(self) > MAX_SAMPLES:
             self._start += 1
+        return True
 
     def clear(self) -> None:
         """Drop all samples: the clock was set back."""

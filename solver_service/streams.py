@@ -136,12 +136,13 @@ class NodeStream:
         at = bisect.bisect_right(self._calibrations, stamp_ns, key=_since)
         return self._calibrations[max(at - 1, 0)] if self._calibrations else None
 
-    def add_sample(self, sample: Attitude | Depth | Imu) -> None:
-        """Take a sample of one of the sensors."""
+    def add_sample(self, sample: Attitude | Depth | Imu) -> bool:
+        """Take a sample of one of the sensors; return False for an inertial one that came before."""
         sensor: Sensor
+        is_new = True
         if isinstance(sample, Imu):
             sensor = self.imu
-            self.imu.add(sample)
+            is_new = self.imu.add(sample)
         elif isinstance(sample, Attitude):
             sensor = self.attitude
             self.attitude.add(sample)
@@ -150,6 +151,7 @@ class NodeStream:
             self.depth.add(sample)
         if self.newest_ns is None or sample.stamp_ns >= self.newest_ns - SENSOR_WAIT_NS:
             sensor.missing_ns = 0
+        return is_new
 
     def add_frame(
         self, frame: Candidates, others_ns: Iterable[int], receive_ns: int | None, *, live: bool = False

@@ -154,6 +154,19 @@ def test_inertial_samples_that_come_too_late_are_counted_and_named_while_they_do
     assert 50 < statuses[5].late_imu < statuses[11].late_imu <= 150
 
 
+def test_inertial_samples_that_come_again_a_second_later_are_not_late(five_seconds):
+    """As where a publisher sends again what may have been lost."""
+    messages, _ = five_seconds
+    again = [(message.stamp_ns + S_NS, message) for message in messages if isinstance(message, Imu)]
+    solver = SolverCore(Settings(), [("a", "b")], track=TrackSettings(frozenset(("filter",)), 20.0))
+    timed = [(message.stamp_ns + S_NS // 50, message) for message in messages]
+    for receive_ns, message in sorted([*timed, *again], key=lambda one: one[0]):
+        solver.handle(message, receive_ns)
+    (status,) = solver.report(receive_ns, receive_ns, 0, [])
+    assert status.late_imu is UNSET
+    assert "too late" not in status.problem
+
+
 def test_a_track_goes_on_without_inertial_samples_and_says_so(inertial_dive):
     messages, world = inertial_dive
     gap_ns = [messages[0].stamp_ns + seconds * S_NS for seconds in (3, 7)]
