@@ -86,6 +86,13 @@ class SolverFollower:
             self._changed.notify_all()
 
     def _watch(self, name: str, alive: bool) -> None:
+        node = name.removeprefix("node/")
+        if alive and node != name and node in self._sent_ns:
+            log.warning(
+                "play: node %s runs on this bus, and its messages mix with the dive's: poses of both may be wrong; "
+                "stop one of them, or play to a hub of its own (--connect)",
+                node,
+            )
         with self._changed:
             if name.startswith("solver/"):
                 (self._solvers.add if alive else self._solvers.discard)(name)

@@ -210,3 +210,14 @@ def test_playback_stays_until_the_solver_has_answered_the_last_frames(log, monke
 
 def test_playback_stays_longer_than_until_the_next_heartbeat():
     assert play.LINGER_S > HEARTBEAT_S
+
+
+def test_a_running_node_of_the_dives_own_id_is_named(log, caplog):
+    network = LocalNetwork()
+    with Dive([log]) as dive, network.connect() as bus, network.connect() as node, network.connect() as other:
+        Player(bus, dive.nodes("candidates"), 1.0, ManualClock(5), threading.Event())
+        other.declare_alive("node/elsewhere")
+        node.declare_alive("node/b")
+        until(lambda: caplog.messages)
+    assert len(caplog.messages) == 1
+    assert "node b runs on this bus" in caplog.messages[0]
