@@ -27,6 +27,7 @@ FOCAL_PX, WIDTH_PX, HEIGHT_PX = 900.0, 820, 616
 class Setting:
     """What a dive is like. poor: the inertial units are off their mounts, late, off their told place, and walk.
 
+    cabled: a cable triggers both nodes at one instant, in place of each one's own clock.
     lasting_s: half of each light's variance is of an error that wanders, exp(-t / lasting_s); candidates tell so.
     """
 
@@ -40,6 +41,7 @@ class Setting:
     dead: tuple[tuple[int, int], ...] = ()
     dark_s: tuple[float, float] | None = None
     clock_s: float = 0.0
+    cabled: bool = False
     depth_offset_m: float = 0.0
     lasting_s: float = 0.0
 
@@ -130,10 +132,10 @@ def make(seed: int, setting: Setting, motion: SwayingPair | None = None, lamps: 
         off = rotation_exp(rng.normal(0.0, np.radians(1.0), 3)) if setting.poor else np.eye(3)
         units.append((lever, off, rng.uniform(0.002, 0.006) if setting.poor else 0.0))
     triggers = np.arange(2, int(setting.seconds * setting.rate_hz)) / setting.rate_hz
-    # Each node takes its pictures when its own clock says so.
+    later_s = 0.0 if setting.cabled else setting.clock_s
     frames = [
-        _frames(rng, motion, nodes, node, triggers - clock_s, setting, lamps)
-        for node, clock_s in enumerate((0.0, setting.clock_s))
+        _frames(rng, motion, nodes, node, instants, setting, lamps)
+        for node, instants in enumerate((triggers, triggers - later_s))
     ]
     records = []
     for node in (0, 1):

@@ -513,7 +513,7 @@ def test_clocks_more_than_half_a_second_apart(clock_s: float) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 3, 4])
 def test_a_live_track_of_clocks_half_a_second_apart_is_not_told(seed: int) -> None:
-    dive = make(seed, replace(SHORT, seconds=14.0, clock_s=0.5))
+    dive = make(seed, replace(SHORT, seconds=14.0, clock_s=0.5, cabled=True))
     track = filter_of(dive.records, dive.fixes)
     rows = track.advance(dive.stamps_ns[-1], dive.stamps_ns)
     assert len(rows) < 0.3 * len(dive.stamps_ns)
