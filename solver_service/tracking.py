@@ -444,12 +444,14 @@ class PairTracker:
         ]
 
     def _due(self, start_ns: int, end_ns: int) -> list[int]:
-        """Return the instants of the rows from start_ns to end_ns, of a longer gap those of its beginning.
+        """Return the instants of the rows from start_ns to end_ns; of what is long, those of both ends.
 
-        After that nothing is known, and where clocks are weeks apart, the instants in between would fill the memory.
+        Nothing is known in between, and where clocks are weeks apart, its instants would fill the memory.
         """
-        first = -(-start_ns // self._period_ns)
-        rows = range(first, min(end_ns, start_ns + KEPT_NS) // self._period_ns + 1)
+        ends = [(start_ns, end_ns)]
+        if end_ns - start_ns > 2 * KEPT_NS:
+            ends = [(start_ns, start_ns + KEPT_NS), (end_ns - KEPT_NS, end_ns)]
+        rows = chain.from_iterable(range(-(-a // self._period_ns), b // self._period_ns + 1) for a, b in ends)
         return [k * self._period_ns for k in rows if not k % self.one_in]
 
     def _piece(self, stream: NodeStream, node: int, start_ns: int, end_ns: int) -> NodeRecord:
