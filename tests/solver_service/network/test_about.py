@@ -5,7 +5,7 @@ import pytest
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.network.estimate import NetEstimate
 from buddyline.solver_service.network.sights import light_positions
-from buddyline.solver_service.network.state import BLOCK, P_, PHI, NetState, block
+from buddyline.solver_service.network.state import BLOCK, COMMON, P_, PHI, NetState, block
 from buddyline.solver_service.track.lights import Sight, pixels_of
 
 from tests.solver_service.network.test_jacobians import LIGHTS_M, PINHOLE, a_state, an_estimate
@@ -25,14 +25,14 @@ def seen(state: NetState, observer: int, other: int) -> Sight:
 
 def wide_estimate(true: NetState, off_m: Floats) -> NetEstimate:
     """Give an estimate of three members of which the place of the second is known to a metre."""
-    error = np.zeros(1 + 3 * BLOCK)
+    error = np.zeros(COMMON + 3 * BLOCK)
     error[block(1)][P_] = off_m
     estimate = an_estimate(true.plus(error))
     for _ in estimate.members:
         estimate.shaking = estimate.shaking.joined()
     # A node that has no pictures is gone.
     estimate.intake._hear(1, 0.0)
-    estimate.covariance = 1e-10 * np.eye(1 + 3 * BLOCK)
+    estimate.covariance = 1e-10 * np.eye(COMMON + 3 * BLOCK)
     estimate.covariance[block(1), block(1)][P_, P_] = np.eye(3)
     estimate.covariance[block(1), block(1)][PHI, PHI] = 0.05**2 * np.eye(3)
     return estimate
