@@ -444,9 +444,9 @@ class PairTracker:
         ]
 
     def _due(self, start_ns: int, end_ns: int) -> list[int]:
-        """Return the instants of the rows from start_ns to end_ns; of what is long, those of both ends.
+        """Return the instants of the rows from start_ns to end_ns; of a long span only those near both ends.
 
-        Nothing is known in between, and where clocks are weeks apart, its instants would fill the memory.
+        Nothing is known in between. Where clocks are weeks apart, all instants would fill the memory.
         """
         ends = [(start_ns, end_ns)]
         if end_ns - start_ns > 2 * KEPT_NS:

@@ -104,6 +104,7 @@ def told_steps(of_nodes: Sequence[Samples], delays_s: Floats, times_s: Floats) -
         times_s=grid_s.reshape(count, most),
         values=each[..., :6],
         told=np.ones((count, most - 1), dtype=bool),
+        onward_radps=each[:, -1, 3:6],
         slow_radps=np.stack(slow_radps, axis=1).reshape(count, 2, 3),
         fast=each[..., 6:12],
     )

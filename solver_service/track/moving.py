@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 
 import numpy as np
-from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
+from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.guessing import GuessedMotion
@@ -49,7 +49,7 @@ TOGETHER_S: Final = 0.005
 # The clocks' offset is believed where it is known better than this, 1 sd. Only then is learned how much the biases
 # walk: an unknown offset looks like a walk.
 KNOWN_CLOCK_S: Final = 0.008
-# Carried on for less than this, a node turns as it does now.
+# A node that is carried on for less than this keeps its turn rate.
 LITTLE_CARRIED_S: Final = 0.003
 MAX_DELAY_S: Final = 0.03
 # How fast a node without an inertial unit turns, and how far off its attitude may be, 1 sd.
@@ -71,22 +71,24 @@ Number = TypeVar("Number", np.float64, np.bool_)
 
 @dataclass(frozen=True, eq=False)
 class Excerpt:
-    """One node's samples between two times: times_s (M,), values (M, 13), told (M - 1,), slow_radps (2, 3).
+    """One node's samples between two times, as in SampleGrid: times_s (M,), values (M, 13), told (M - 1,).
 
-    As in SampleGrid. without: whether there is no unit at all. faster_radps (3,): by how much faster it turns, on mean,
-    while it is carried on from the end to the other node's clock.
+    onward_radps (3,), slow_radps (2, 3). without: whether there is no unit at all.
     """
 
     times_s: Floats
     values: Floats
     told: Bools
+    onward_radps: Floats
     slow_radps: Floats
     without: bool
-    faster_radps: Floats
 
 
 def excerpt(samples: Samples, delay_s: float, from_s: float, to_s: float, carried_s: float = 0.0) -> Excerpt:
-    """Give a node's samples from one time to the next, by its own clock's delay; it is carried on by carried_s."""
+    """Give a node's samples from one time to the next, by its own clock's delay.
+
+    carried_s: for how long the node is then carried on, to the other node's clock.
+    """
     known_s = to_s + HOLD_S
     shift = min(max(delay_s, -MAX_DELAY_S), MAX_DELAY_S)
     times_s, values, told = samples.between(from_s + shift, to_s + shift, known_s)
@@ -98,21 +100,21 @@ def excerpt(samples: Samples, delay_s: float, from_s: float, to_s: float, carrie
         rate = samples.slow_rate(each_s, known_s)
         if rate is not None:
             slow[end] = rate
-    faster = np.zeros(3) if without else _faster(samples, to_s + shift, known_s, carried_s, values[-1, 3:6])
-    return Excerpt(times_s, values, told, slow, without, faster)
+    onward = values[-1, 3:6]
+    if abs(carried_s) > LITTLE_CARRIED_S and not without:
+        onward = _mean_rate(samples, to_s + shift, known_s, carried_s)
+    return Excerpt(times_s, values, told, onward, slow, without)
 
 
-def _faster(samples: Samples, at_s: float, known_s: float, carried_s: float, rate_radps: Floats) -> Floats:
-    """Give the mean turn rate (3,) while a node is carried on from at_s, over that at at_s.
+def _mean_rate(samples: Samples, at_s: float, known_s: float, carried_s: float) -> Floats:
+    """Give the mean turn rate (3,) while a node is carried on from at_s.
 
     Lights are carried over all of the clocks' offset, rows over half of it: the mean is over two thirds.
     """
-    if abs(carried_s) < LITTLE_CARRIED_S:
-        return np.zeros(3)
     first_s, last_s = sorted((at_s, min(at_s + 2.0 / 3.0 * carried_s, known_s)))
     times_s, values, _ = samples.between(first_s, last_s, known_s)
     steps = (times_s[1:] - times_s[:-1]) / (times_s[-1] - times_s[0])
-    return np.asarray(0.5 * steps @ (values[1:, 3:6] + values[:-1, 3:6]) - rate_radps)
+    return np.asarray(0.5 * steps @ (values[1:, 3:6] + values[:-1, 3:6]))
 
 
 def integrated(state: Carried, of_nodes: Sequence[Excerpt], *, by_shares: bool = False) -> Increments:
@@ -122,14 +124,12 @@ def integrated(state: Carried, of_nodes: Sequence[Excerpt], *, by_shares: bool =
         _padded([one.times_s for one in of_nodes]),
         every[..., :6],
         _padded([one.told for one in of_nodes]),
+        np.array([one.onward_radps for one in of_nodes]),
         np.array([one.slow_radps for one in of_nodes]),
         every[..., 6:12] if by_shares else None,
     )
     without = np.array([one.without for one in of_nodes])
-    parts = integrate(state, grid)
-    faster = (rotation_exp(-state.mount_rad) @ np.array([one.faster_radps for one in of_nodes])[..., None])[..., 0]
-    rates = parts.rate_radps + faster
-    return replace(parts, rate_radps=rates, without=without, sudden_rad=every[..., 12].max(axis=1))
+    return replace(integrate(state, grid), without=without, sudden_rad=every[..., 12].max(axis=1))
 
 
 def increments(
@@ -143,7 +143,7 @@ def increments(
 ) -> Increments:
     """Integrate the samples of a state's nodes from one time to the next, each by its own clock's delay.
 
-    carried_s: by how much each is carried on from there. by_shares: whether to tell what shares of the samples' fast
+    carried_s: for how long each is then carried on. by_shares: whether to tell what shares of the samples' fast
     parts do.
     """
     found = [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -89,6 +90,17 @@ def pose_jacobian(now: State) -> Floats:
     return J
 
 
+def of_offset(r_m: Floats) -> tuple[Floats, Floats, Floats]:
+    """Give by what (3, 3) a fix's place, and its turn, move with the velocity v, and its turn with the turn rates w.
+
+    Per second between the clocks, for B at r_m (3,) (`as_a_fix_sees_it`).
+    """
+    range_m = math.sqrt(float(r_m @ r_m))
+    e = r_m / range_m
+    half_along = 0.5 * np.outer(e, e)
+    return np.eye(3) - half_along, skew(e) / range_m, half_along
+
+
 def as_a_fix_sees_it(state: State, rates_radps: Floats) -> tuple[State, Floats]:
     """Give the state of which a fix tells t and R_a_b, and its errors (NAV, C) by the state's errors of COLUMNS.
 
@@ -98,11 +110,7 @@ def as_a_fix_sees_it(state: State, rates_radps: Floats) -> tuple[State, Floats]:
     To first order of c; how e changes by the errors is of the second.
     """
     c, r, v = float(state.clock_s), state.r_m, state.v_mps
-    range_m = float(state.range_m)
-    e = r / range_m
-    half_along = 0.5 * np.outer(e, e)
-    moved = np.eye(3) - half_along
-    swept = skew(e) / range_m
+    moved, swept, half_along = of_offset(r)
     r_per_s, turn_per_s = moved @ v, swept @ v + half_along @ (state.R @ rates_radps[..., None]).sum(axis=0)[:, 0]
     seen = state.moved(r + c * r_per_s, v, np.stack((state.R[0], rotation_exp(c * turn_per_s) @ state.R[1])))
     J = np.zeros((NAV, len(COLUMNS)))

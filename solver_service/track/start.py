@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.rotation import Floats, skew
+from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.anchors import attitude_covariance
 from buddyline.solver_service.track.inputs import AttitudeSeen, FixSeen, TrackNode
+from buddyline.solver_service.track.output import of_offset
 from buddyline.solver_service.track.shaking import SHAKE_RAD, SHOVE_MPS, Shaking
 from buddyline.solver_service.track.state import (
     ACCEL_BIAS,
@@ -135,9 +136,9 @@ def state_from_fix(
 ) -> tuple[State, Floats] | None:
     """Start from a fix, with A's attitude by its message or else its accelerometer; None where neither tells.
 
-    R_B = R_A R_a_b, r = R_A t: r errs by R_A dt, and phi_B = phi_A + R_A w. Both err by what moves while the clocks are
-    apart, too (output.as_a_fix_sees_it). rates_radps (3,): the nodes' turn rates, None where a node has no inertial
-    unit: then nothing is added, for such a start would drift off by guessed motion.
+    R_B = R_A R_a_b, r = R_A t: r errs by R_A dt, and phi_B = phi_A + R_A w. An unknown offset of the clocks adds to
+    both (output.as_a_fix_sees_it). rates_radps: A's and B's turn rates (3,), None where a node has no inertial unit.
+    Then nothing is added: such a start would drift off by guessed motion.
     """
     if attitude is not None:
         R_A = attitude.R_ned_body @ nodes[0].rig.R_body_camera
@@ -163,14 +164,14 @@ def state_from_fix(
 
 
 def _by_unknown_clock(state: State, turning_radps: Floats) -> Floats:
-    """Give the covariance (SIZE, SIZE) of a fix's plain errors by clocks 1 s apart (1 sd), and a velocity of SPEED_MPS.
+    """Give what a clock offset of 1 s (1 sd) adds to the covariance (SIZE, SIZE) of a fix's plain errors.
 
-    By `output.as_a_fix_sees_it`. turning_radps (3,): the sum of both nodes' turn rates, level. Without the clock's own.
+    The offset's own variance is left out. The velocity is unknown, SPEED_MPS (1 sd). turning_radps (3,): the sum of
+    both nodes' turn rates, level.
     """
-    e = state.r_m / state.range_m
-    half_along = 0.5 * np.outer(e, e)
+    moved, swept, half_along = of_offset(state.r_m)
     by_way = np.zeros((SIZE, 3))
-    by_way[R_], by_way[PHI[1]] = half_along - np.eye(3), -skew(e) / state.range_m
+    by_way[R_], by_way[PHI[1]] = -moved, -swept
     by_clock = np.zeros(SIZE)
     by_clock[PHI[1]] = -half_along @ turning_radps
     covariance: Floats = SPEED_MPS**2 * by_way @ by_way.T + np.outer(by_clock, by_clock)

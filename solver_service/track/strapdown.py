@@ -130,14 +130,16 @@ class SampleGrid:
     """Samples of nodes (N) between two times, at points (M) of each node's own grid, in camera axes, uncorrected.
 
     times_s (N, M); values (N, M, 6): force and rate there. told (N, M - 1): whether the accelerometer covers each
-    interval; where not, the node moves on unaccelerated. slow_radps (N, 2, 3): the turn rates at both ends without
-    shaking. Delay and lever arm are told by them: by rates that are themselves shaken both would be fitted to the
-    shaking. fast (N, M, 6): the fast part of the values; None where it is not asked for.
+    interval; where not, the node moves on unaccelerated. onward_radps (N, 3): the turn rates by which nodes are carried
+    on from the end. slow_radps (N, 2, 3): the turn rates at both ends without shaking. Delay and lever arm are told by
+    them: by rates that are themselves shaken both would be fitted to the shaking. fast (N, M, 6): the fast part of the
+    values; None where it is not asked for.
     """
 
     times_s: Floats
     values: Floats
     told: Bools
+    onward_radps: Floats
     slow_radps: Floats
     fast: Floats | None = None
 
@@ -178,7 +180,9 @@ def integrate(state: Carried, grid: SampleGrid) -> Increments:
     biases = np.concatenate((state.accel_bias_mps2, state.gyro_bias_radps), axis=1)
     unbiased = (grid.values - biases[:, None]).reshape(count, 2 * points, 3)
     values = (unbiased @ to_true).reshape(count, points, 6)
-    slow = (grid.slow_radps - state.gyro_bias_radps[:, None]) @ to_true
+    rates = np.concatenate((grid.onward_radps[:, None], grid.slow_radps), axis=1)
+    rates = (rates - state.gyro_bias_radps[:, None]) @ to_true
+    onward, slow = rates[:, :1], rates[:, 1:]
     h = t[:, 1:] - t[:, :-1]
     middle = 0.5 * (values[:, 1:] + values[:, :-1])
     f_mid, w_mid = middle[:, :, :3], middle[:, :, 3:]
@@ -264,7 +268,7 @@ def integrate(state: Carried, grid: SampleGrid) -> Increments:
         dp_m=gained[:, 1],
         jacobian=J,
         gap_s=np.add.reduce(h * ~told, axis=1),
-        rate_radps=values[:, -1, 3:],
+        rate_radps=onward[:, 0],
         by_fast=by_fast,
         without=np.zeros(count, dtype=bool),
         sudden_rad=np.zeros(count),

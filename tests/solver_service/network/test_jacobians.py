@@ -125,7 +125,7 @@ def test_a_step() -> None:
         grid, values, slow = samples(moved, member, 0.0)
         told = np.ones((1, len(grid) - 1), dtype=bool)
         own = moved.chosen([member])
-        parts = integrate(own, SampleGrid(grid[None], values[None], told, slow[None]))
+        parts = integrate(own, SampleGrid(grid[None], values[None], told, values[None, -1, 3:], slow[None]))
         end, F, _, _ = moved_members(own, parts, [Noise(1e-3, 1e-2)], np.full((1, 2), 1e-6), span_s)
         found["F"] = F[0]
         return moved.replaced([member], end)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
+from buddyline.solver_service.track.moving import increments
 from buddyline.solver_service.track.samples import Samples, false_ones
+
+from tests.solver_service.track.test_track_jacobians import a_state
 
 TIMES_S = np.array((1.0, 1.01, 1.02, 1.03))
 
@@ -118,3 +121,17 @@ def test_of_a_unit_that_vibrates_torn_samples_alone_are_false(at_once: int) -> N
     left_out = np.setdiff1d(t, samples.times_s)
     assert {6.0, 7.0} <= set(np.round(left_out, 2).tolist())
     assert len(left_out[left_out > 0.4]) < 8
+
+
+def test_a_node_is_carried_on_by_its_mean_turn_rate_in_the_cameras_axes() -> None:
+    """Over two thirds of 30 ms, on for B and back for A, at a constant acceleration; by 2 ms it keeps its rate."""
+    state, t_s = a_state(2), np.arange(0.0, 2.0, 0.01)
+    rate, faster = np.array((0.3, -0.2, 0.4)), np.array((2.0, 1.5, -2.5))
+    samples = Samples()
+    samples.add(t_s, np.hstack((np.zeros((len(t_s), 3)), rate + t_s[:, None] * faster)))
+    for carried_s, mean_s in ((0.03, 0.01), (0.002, 0.0)):
+        parts = increments([samples, samples], state, 1.0, 1.1, carried_s=(-carried_s, carried_s))
+        for node, sign in enumerate((-1.0, 1.0)):
+            raw = rate + (1.1 + state.delay_s[node] + sign * mean_s) * faster
+            true = rotation_exp(state.mount_rad[node]) @ (raw - state.gyro_bias_radps[node])
+            assert parts.rate_radps[node] == pytest.approx(true, abs=1e-9)

@@ -181,7 +181,7 @@ def increments(state: State) -> Increments:
         for column, of in enumerate((*force.T, *turn.T)):
             values[node, :, column] = np.interp(grid + state.delay_s[node], t, of)
     told = np.ones((2, 40), dtype=bool)
-    return integrate(state, SampleGrid(np.stack((grid, grid)), values, told, values[:, [0, -1], 3:]))
+    return integrate(state, SampleGrid(np.stack((grid, grid)), values, told, values[:, -1, 3:], values[:, [0, -1], 3:]))
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -90,7 +90,9 @@ def test_what_a_share_moves(column: int) -> None:
         values[column // 2, :, of_sensor] -= share * fast[column // 2, :, of_sensor]
         told = np.ones((2, 40), dtype=bool)
         still = state.with_parts(lever_m=0.0)
-        both = integrate(still, SampleGrid(np.stack((grid, grid)), values, told, values[:, [0, -1], 3:], fast))
+        both = integrate(
+            still, SampleGrid(np.stack((grid, grid)), values, told, values[:, -1, 3:], values[:, [0, -1], 3:], fast)
+        )
         assert both.by_fast is not None
         moved, _ = propagate(still, both, 0.1)
         return moved, moved_by_shares(moved, both.by_fast)
