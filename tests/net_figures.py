@@ -44,11 +44,11 @@ from buddyline.solver_service.track.samples import Samples
 from buddyline.solver_service.track.strapdown import Noise
 from buddyline.solver_service.tracking import Coming, PairTracker
 
+from tests.told_units import sigmas_of, walks_of
+
 START_NS = 1_764_000_000_000_000_000
 # Beyond these a row is wrong, as `evaluate` has it.
 WRONG_M, WRONG_RAD = 0.3, 0.1
-# A bias's wandering part of 1 sd (node/sim/inertial.WALK_S) changes in 10 s by as much as a walk of this density.
-WALKED = 0.28
 FOUR = {"more_nodes": ("c", "d"), "fixed_nodes": ("a",)}
 # Nodes a and c stand, and b moves to 6 m away.
 BASIN = {"more_nodes": ("c",), "fixed_nodes": ("a", "c"), "environment": "basin", "range_max_m": 6.0}
@@ -131,17 +131,12 @@ def told(grade: Grade) -> Iterator[None]:
     """Tell the network the simulator's own sigmas; a unit that nothing shakes is known not to be shaken."""
 
     def noise(self: Samples, time_s: float) -> Noise:
-        gyro, accel = WALKED * grade.gyro_walk_radps, WALKED * grade.accel_walk_mps2
+        gyro, accel = walks_of(grade)
         return sampled(self, time_s)._replace(gyro_bias_radps=gyro, accel_bias_mps2=accel)
 
     sampled = Samples.noise
-    least_s, most_s = (ns * 1e-9 for ns in grade.delay_ns)
     sigmas = {
-        "GYRO_BIAS_RADPS": math.hypot(grade.gyro_bias_radps, grade.gyro_walk_radps),
-        "ACCEL_BIAS_MPS2": math.hypot(grade.accel_bias_mps2, grade.accel_walk_mps2),
-        "MOUNT_RAD": grade.misalignment_rad / math.sqrt(3.0),
-        "LEVER_TOLD_M": grade.lever_sigma_m,
-        "DELAY_UNTOLD_S": max(math.hypot((least_s + most_s) / 2, (most_s - least_s) / math.sqrt(12.0)), 1e-6),
+        **sigmas_of(grade),
         # The simulator's clocks, gauges and density are right.
         "CLOCK_S": 1e-6,
         "GAUGE_M": 1e-5,

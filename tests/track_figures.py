@@ -6,10 +6,13 @@
     .venv/bin/python -m tests.track_figures --dead a.left --modes smooth
     .venv/bin/python -m tests.track_figures --dark 5 --range 4 8         # no light for 5 s in the middle
     .venv/bin/python -m tests.track_figures --clock-ms 300 --gauge 0.5   # unknown to the solver
+    .venv/bin/python -m tests.track_figures --told                       # how good such a track can be
 
 Dives go through the whole solver, and are judged as `evaluate` judges them. Each seed has one of the waters. A line for
-each dive and mode, and one for each mode over all. Status 1 where more than a thousandth of a mode's rows are wrong, or
-no dive has a track. A dive of a minute takes some 10 s of CPU.
+each dive and mode, and one for each mode over all. With `--told` the track is told the simulator's own sigmas of the
+units, and that clocks, gauges and the water's density are right: by what it errs then, no estimate can err much less.
+Status 1 where more than a thousandth of a mode's rows are wrong, or no dive has a track. A dive of a minute takes some
+10 s of CPU.
 """
 
 from __future__ import annotations
@@ -18,10 +21,13 @@ import argparse
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from unittest.mock import patch
 
 import numpy as np
 from buddyline.node.sim import dive as simulation
+from buddyline.node.sim.inertial import GRADES, Grade
 from buddyline.node.sim.scenario import ENVIRONMENTS, INERTIAL_GRADES, DivePlan, Scenario
 from buddyline.node.sim.world import World
 from buddyline.protocol.clock import MS_NS, S_NS
@@ -37,6 +43,9 @@ from buddyline.protocol.messages import (
 )
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.trigger import Settings
+from buddyline.solver_service.track import dive as whole_dive
+from buddyline.solver_service.track import start, walking
+from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.tracking import TrackSettings
 from buddyline.tools.evaluation.poses import pose_errors
 from buddyline.tools.evaluation.statistics import Stats
@@ -45,8 +54,12 @@ from buddyline.tools.evaluation.truth import TruthTrack
 from buddyline.tools.solve import solved as solve
 from msgspec.structs import replace
 
+from tests.told_units import sigmas_of, walks_of
+
 START_NS = 1_764_000_000 * S_NS
 MODES = ("smooth", "lag", "filter")
+# 1 sd of clocks that are told to be right.
+KNOWN_S = 1e-5
 
 
 @dataclass(frozen=True)
@@ -94,6 +107,28 @@ def told(world: World, args: argparse.Namespace) -> Iterator[Message]:
             yield message
 
 
+@contextmanager
+def told_units(grade: Grade) -> Iterator[None]:
+    """Tell the track the simulator's own sigmas of its units, and that clocks, gauges and density are right."""
+    sigmas = {**sigmas_of(grade), "DEPTH_OFFSET_M": 1e-4, "DEPTH_SCALE_SIGMA": 1e-5}
+    first = walking.FIRST_LOGS, walking.FIRST_INFORMATION, walking.LEAST
+    kept = [each.copy() for each in first]
+    logs, information, least = first
+    logs[walking.OF_UNITS] = least[walking.OF_UNITS] = 2.0 * np.log(walks_of(grade))
+    # So they are not learned.
+    information[walking.OF_UNITS, walking.OF_UNITS] *= 1e6
+    try:
+        with (
+            patch.multiple(start, **sigmas),
+            patch.dict(TrackFilter.__init__.__kwdefaults__, clock_sigma_s=KNOWN_S),
+            patch.object(whole_dive, "CLOCK_S", KNOWN_S),
+        ):
+            yield
+    finally:
+        for each, before in zip(first, kept, strict=True):
+            each[:] = before
+
+
 def is_dark(stamp_ns: int, args: argparse.Namespace) -> bool:
     """Tell whether an instant is in the dark seconds, which are in the middle."""
     return abs((stamp_ns - START_NS) / S_NS - 0.5 * args.seconds) <= 0.5 * args.dark
@@ -114,7 +149,8 @@ def solved(seed: int, args: argparse.Namespace) -> list[TrackDive]:
         )
     )
     core = SolverCore(Settings(), [("a", "b")], track=TrackSettings(frozenset(args.modes)))
-    found = list(solve(core, told(world, args)))
+    with told_units(GRADES[args.inertial]) if args.told else nullcontext():
+        found = list(solve(core, told(world, args)))
 
     def truth_of(samples: list[RelativePose] | list[Track]) -> TruthTrack:
         return TruthTrack([world.truth(one.stamp_ns, 0) for one in samples])
@@ -147,12 +183,16 @@ def options() -> argparse.ArgumentParser:
     parser.add_argument("--dark", type=float, default=0.0, metavar="SECONDS")
     parser.add_argument("--clock-ms", type=float, default=0.0)
     parser.add_argument("--gauge", type=float, default=0.0, metavar="M")
+    parser.add_argument("--told", action="store_true", help="tell the track what the simulator knows of the units")
     return parser
 
 
 def main() -> int:
     """Run as a program."""
-    args = options().parse_args()
+    parser = options()
+    args = parser.parse_args()
+    if args.told and (args.inertial == "none" or args.clock_ms or args.gauge):
+        parser.error("--told tells of units, and that clocks and gauges are right")
     dives: defaultdict[str, list[TrackDive]] = defaultdict(list)
     for seed in args.seeds:
         for dive in solved(seed, args):
