@@ -11,6 +11,15 @@ from buddyline.protocol.clock import S_NS
 from numpy.typing import NDArray
 
 
+def trigger_moved(trigger: int, offset_ns: int, period_ns: int) -> int:
+    """Return the number that a trigger of a clock that is offset_ns ahead has on the common clock.
+
+    All of a clock's triggers move by as many: where the offset is half a period, the stamps' scatter would else move
+    some by one more than others, so that two have one number, and others none.
+    """
+    return max(trigger - round(offset_ns / period_ns), 0)
+
+
 @dataclass(frozen=True, eq=False)
 class ClockCurve:
     """A clock minus the common clock: straight lines between its points, and level beyond the first and the last.

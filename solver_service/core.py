@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import combinations
 from typing import Final, TypeAlias
 
-from buddyline.protocol.clock import LIVE_WITHIN_NS, MS_NS, S_NS, trigger_index
+from buddyline.protocol.clock import LIVE_WITHIN_NS, MS_NS, S_NS
 from buddyline.protocol.messages import (
     Attitude,
     Candidates,
@@ -25,7 +25,7 @@ from buddyline.protocol.messages import (
     RelativePose,
     SolverStatus,
 )
-from buddyline.solver_service.clock_curve import ClockCurve
+from buddyline.solver_service.clock_curve import ClockCurve, trigger_moved
 from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.health import Health
 from buddyline.solver_service.networking import NetTracker
@@ -375,5 +375,7 @@ class SolverCore:
         if not isinstance(message, Candidates):
             return replace(message, stamp_ns=stamp_ns)
         calibration = stream.calibration(stamp_ns)
-        trigger = trigger_index(stamp_ns, calibration[0].trigger_period_ns) if calibration else message.trigger
+        if calibration is None:
+            return replace(message, stamp_ns=stamp_ns)
+        trigger = trigger_moved(message.trigger, offset_ns, calibration[0].trigger_period_ns)
         return replace(message, stamp_ns=stamp_ns, trigger=trigger)

@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Self, TypeVar
 
-from buddyline.protocol.clock import trigger_index
 from buddyline.protocol.messages import Attitude, Candidates, LightTruth, NodePose, Truth
-from buddyline.solver_service.clock_curve import ClockCurve
+from buddyline.solver_service.clock_curve import ClockCurve, trigger_moved
 from buddyline.tools.evaluation.recorded import Recorded
 from buddyline.tools.evaluation.truth import CLOSE_NS
 from buddyline.tools.pairs import Pair
@@ -72,10 +71,12 @@ def _moved(message: OfNode, recorded: Recorded, curves: Mapping[str, ClockCurve]
     curve, info = curves.get(message.node), recorded.infos.get(message.node)
     if curve is None:
         return message
-    stamp_ns = max(message.stamp_ns - curve.offset_ns(message.stamp_ns), 0)
+    offset_ns = curve.offset_ns(message.stamp_ns)
+    stamp_ns = max(message.stamp_ns - offset_ns, 0)
     if isinstance(message, Attitude) or info is None:
         return replace(message, stamp_ns=stamp_ns)
-    return replace(message, stamp_ns=stamp_ns, trigger=trigger_index(stamp_ns, info.trigger_period_ns))
+    trigger = trigger_moved(message.trigger, offset_ns, info.trigger_period_ns)
+    return replace(message, stamp_ns=stamp_ns, trigger=trigger)
 
 
 def truth_moved(truth: Truth, pair: Pair, curves: Mapping[str, ClockCurve]) -> Truth:
