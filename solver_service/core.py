@@ -55,11 +55,12 @@ class SolverCore:
 
     chosen: the pairs to solve; None for every pair of nodes that appear, A before B in the alphabet. clocks: each
     node's clock minus the common clock, where known; the node's stamps are moved to the common clock. align: estimate
-    the clock offset of each pair. track: the tracks to make; None for no track, and no network. lone: nodes of the
-    network beside those of the chosen pairs. network: follows all nodes in one frame; None without `track`. unused:
-    number of messages of each node that is not used. pace: what is left out where it cannot keep up. shared: other
-    cores have some of the pairs, and perhaps the network: this one begins with none, and gets its own by `adopt` and
-    `adopt_network`.
+    the clock offset of each pair. apart_s: of pairs, B's clock minus A's as the whole dive has told it, for the whole
+    dive's track; stamps and triggers stay, and the poses count it. track: the tracks to make; None for no track, and no
+    network. lone: nodes of the network beside those of the chosen pairs. network: follows all nodes in one frame; None
+    without `track`. unused: number of messages of each node that is not used. pace: what is left out where it cannot
+    keep up. shared: other cores have some of the pairs, and perhaps the network: this one begins with none, and gets
+    its own by `adopt` and `adopt_network`.
     """
 
     def __init__(
@@ -69,6 +70,7 @@ class SolverCore:
         clocks: Mapping[str, ClockCurve] | None = None,
         *,
         align: bool = False,
+        apart_s: Mapping[PairId, float] | None = None,
         track: TrackSettings | None = None,
         lone: Iterable[str] = (),
         shared: bool = False,
@@ -82,6 +84,7 @@ class SolverCore:
         self._chosen = chosen
         self._clocks = clocks or {}
         self._align = align
+        self._apart_s = apart_s or {}
         self._track = track
         self._shared = shared
         self._pairs_of: dict[str, list[PairCore]] = {}
@@ -361,7 +364,9 @@ class SolverCore:
 
     def _add_pair(self, nodes: PairId) -> PairCore:
         first, second = (self.streams[node] for node in nodes)
-        pair = self.pairs[nodes] = PairCore(first, second, self.settings, self._track, align=self._align)
+        clock_s = self._apart_s.get(nodes, 0.0)
+        pair = PairCore(first, second, self.settings, self._track, align=self._align, clock_s=clock_s)
+        self.pairs[nodes] = pair
         for node in nodes:
             self._pairs_of.setdefault(node, []).append(pair)
         return pair

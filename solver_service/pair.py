@@ -18,7 +18,7 @@ from buddyline.protocol.messages import Candidates, NodeInfo
 from buddyline.solver_service.alignment import ClockAlignment
 from buddyline.solver_service.blinking import LampFollower
 from buddyline.solver_service.geometry.fix import Fix, NoFix
-from buddyline.solver_service.geometry.observation import Heading, Observation, Sensed, Settings, View
+from buddyline.solver_service.geometry.observation import Heading, Observation, Prior, Sensed, Settings, View
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.trigger import TriggerReadings, read_triggers
 from buddyline.solver_service.headings import HeadingOffset
@@ -32,6 +32,11 @@ from msgspec import UNSET
 # processor's caches and, with crowded pictures, into memory.
 _MAX_TOGETHER: Final = 128
 _MAX_COMBINATIONS: Final = 250_000
+# Pictures further apart than this are brought to one instant only by what so many poses, which agree, told of the
+# motion, the last one less than LATELY_S before: a diver who turns moves the other by metres a second in his pictures.
+FAR_NS: Final = S_NS // 10
+AGREED: Final = 2
+LATELY_S: Final = 0.45
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +69,11 @@ class Matched:
         return any(info.blink is not UNSET and not all(lit(info.blink, frame.stamp_ns)) for info, frame in seen)
 
 
+def _tells_motion(prior: Prior | None) -> bool:
+    """Whether poses of just before tell how the nodes move."""
+    return prior is not None and prior.agreed >= AGREED and prior.since_s < LATELY_S
+
+
 def _batches(matched: Sequence[Matched]) -> Iterator[list[Matched]]:
     """Split triggers into batches, which are solved at once; all triggers of a batch have the same calibration."""
     batch: list[Matched] = []
@@ -83,14 +93,16 @@ def _batches(matched: Sequence[Matched]) -> Iterator[list[Matched]]:
 class PairSolver:
     """Solves the triggers of one pair.
 
-    alignment: gets each fix, to estimate the clock offset; None for none. crowded: whether there are many other pairs.
+    alignment: gets each fix, to estimate the clock offset; None for none. clock_s: B's clock minus A's, as far as the
+    stamps still hold it: pictures of one stamp were taken so far apart. crowded: whether there are many other pairs.
     one_in: of so many triggers one is to be solved, of a pair that rests one in LOOKS^2; not of all where the solver of
     these pairs cannot keep up.
     """
 
-    def __init__(self, settings: Settings, alignment: ClockAlignment | None = None) -> None:
+    def __init__(self, settings: Settings, alignment: ClockAlignment | None = None, clock_s: float = 0.0) -> None:
         self.settings = settings
         self.alignment = alignment
+        self._clock_ns = round(clock_s * S_NS)
         self.crowded, self.one_in = False, 1
         self._prior = PosePrior()
         self._headings = HeadingOffset()
@@ -182,8 +194,10 @@ class PairSolver:
         return read_triggers(observations, batch[0].rig_a, batch[0].rig_b, self.settings)
 
     def _view(self, node: int, frame: Candidates, other: NodeInfo) -> View:
-        """Return a frame of node a (0) or b (1), with what the other node's code says of its candidates."""
+        """Return a frame of node a (0) or b (1) by A's clock, with what the other's code says of its candidates."""
         view = view_of(frame)
+        if node:
+            view = replace(view, stamp_ns=view.stamp_ns - self._clock_ns)
         if other.blink is UNSET:
             return view
         whole = frame.elsewhere is UNSET
@@ -203,6 +217,8 @@ class PairSolver:
                 self._remember(matched, found)
         except NUMERIC_ERRORS as error:
             return self._out_of_range(matched, error)
+        if isinstance(found, Fix) and abs(self._clock_ns) > FAR_NS and not _tells_motion(learned[0]):
+            return NoFix("ambiguous", f"pictures {abs(self._clock_ns) / S_NS:.2f} s apart, and no poses just before")
         return found
 
     def _out_of_range(self, matched: Matched, error: Exception) -> NoFix:
@@ -218,5 +234,5 @@ class PairSolver:
             stamp_a_ns, stamp_b_ns = matched.frame_a.stamp_ns, matched.frame_b.stamp_ns
             infos, rigs = (matched.info_a, matched.info_b), (matched.rig_a, matched.rig_b)
             sigma_a_rad, sigma_b_rad = (info.sigma_px / info.camera.fx_px for info in infos)
-            known_s = (stamp_b_ns - stamp_a_ns) / S_NS
+            known_s = (stamp_b_ns - self._clock_ns - stamp_a_ns) / S_NS
             self.alignment.add(stamp_a_ns, fix, rigs, known_s, (sigma_a_rad, sigma_b_rad))

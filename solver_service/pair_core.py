@@ -61,7 +61,8 @@ class PairCore:
     """One pair: its matcher, its solver, its track, and the counts of its outcomes.
 
     counts: number of "solved", and of each rejection reason. latencies_s: from the middle of exposure to publication,
-    since the last report. tracker: makes the pair's track; None for no track.
+    since the last report. tracker: makes the pair's track; None for no track. clock_s: B's clock minus A's, as an
+    earlier pass over the dive has found it.
     """
 
     def __init__(
@@ -72,13 +73,14 @@ class PairCore:
         track: TrackSettings | None,
         *,
         align: bool,
+        clock_s: float = 0.0,
     ) -> None:
         self.nodes: PairId = (stream_a.node, stream_b.node)
         self.streams = stream_a, stream_b
         self.matcher = PairMatcher(stream_a, stream_b)
         self.alignment = ClockAlignment() if align else None
-        self.solver = PairSolver(settings, self.alignment)
-        self.tracker = PairTracker(stream_a, stream_b, track) if track is not None else None
+        self.solver = PairSolver(settings, self.alignment, clock_s)
+        self.tracker = PairTracker(stream_a, stream_b, track, clock_s) if track is not None else None
         self.counts: Counter[str] = Counter()
         self.latencies_s: deque[float] = deque(maxlen=2000)
         self._posed_ns: int | None = None

@@ -105,14 +105,18 @@ class PairTracker:
     crowded: whether it is one of many pairs: its live track then starts from poses alone, for in pictures of many bars
     too many starts without a fix are possible. So nothing is fed to it while there is neither a pose nor a track.
     one_in: of so many triggers and rows one is taken, if not of all without what would come too late (pace.py).
+    clock_s: B's clock minus A's as the whole dive has told it, for the whole dive's track; the poses count it.
     """
 
-    def __init__(self, stream_a: NodeStream, stream_b: NodeStream, settings: TrackSettings) -> None:
+    def __init__(
+        self, stream_a: NodeStream, stream_b: NodeStream, settings: TrackSettings, clock_s: float = 0.0
+    ) -> None:
         self._filter: TrackFilter | None = None
         self.crowded, self.one_in, self._stopped = False, 1, False
         self._past: list[str] = []
         self.late_imu = 0  # inertial samples that came too late
         self._made = False
+        self._clock_ns = round(clock_s * S_NS)
         self._streams = stream_a, stream_b
         self._settings = settings
         self._period_ns = round(S_NS / settings.rate_hz)
@@ -141,6 +145,11 @@ class PairTracker:
         # Whether there was a pose; whether the nodes look apart and never had one; the triggers of then, with stamps.
         self._posed = self._rests = False
         self._unseen: dict[int, int] = {}
+
+    @property
+    def makes_whole(self) -> bool:
+        """Whether it makes a whole dive's track."""
+        return "smooth" in self._settings.modes
 
     @property
     def has_estimate(self) -> bool:
@@ -261,11 +270,7 @@ class PairTracker:
         fixes = [fix_of(one) for one in outcomes if isinstance(one, RelativePose)]
         if fixes:
             self._fixed_ns = max(fix.stamp_ns for fix in fixes)
-        elif (
-            self.crowded
-            and min(stamps_ns) - self._fixed_ns > REST_NS
-            and not (self.has_estimate or "smooth" in self._settings.modes)
-        ):
+        elif self.crowded and min(stamps_ns) - self._fixed_ns > REST_NS and not (self.has_estimate or self.makes_whole):
             self._idle = True
             return Coming()
         messages: list[Message] = []
@@ -299,7 +304,7 @@ class PairTracker:
             self._filter.searches = not self.crowded
             for fix in fixes:
                 self._filter.add_fix(fix)
-        if "smooth" in self._settings.modes:
+        if self.makes_whole:
             self._fixes += fixes
         return replace(self._advance(self._frontier_ns()), messages=messages)
 
@@ -341,7 +346,7 @@ class PairTracker:
                 if not all(self._pieces):
                     return messages
                 asked_ns, self._asked_ns = self._asked_ns, []
-                found = smooth(self._recorded(), self._fixes, asked_ns)
+                found = smooth(self._recorded(), self._fixes, asked_ns, self._clock_ns)
             except NUMERIC_ERRORS as error:
                 self._start_anew(str(error))
                 return []
@@ -375,11 +380,11 @@ class PairTracker:
         for node, stream in enumerate(self._streams):
             piece = self._piece(stream, node, self._taken_ns + 1, to_ns)
             self._oriented |= bool(piece.attitudes)
-            if "smooth" in self._settings.modes:
+            if self.makes_whole:
                 self._pieces[node].append(piece)
             if self._filter is not None:
                 feed(self._filter, node, piece)
-        if "smooth" in self._settings.modes:
+        if self.makes_whole:
             self._asked_ns += self._due(max(self._taken_ns + 1, self._first_ns or 0), to_ns)
         self._taken_ns = to_ns
         self._unseen = {trigger: ns for trigger, ns in self._unseen.items() if ns > to_ns - S_NS}

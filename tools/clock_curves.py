@@ -33,6 +33,8 @@ MIN_SPAN_NS: Final = 60 * S_NS
 OUTSIDE_NS: Final = 120 * S_NS
 # The name of `curves_text` in the metadata of a solved dive.
 CURVES: Final = "clock_curves"
+# The name of `apart_text` in the metadata of a solved dive.
+APART: Final = "clocks_apart"
 # A curve with more points is noted by so many, evenly spaced.
 NOTED: Final = 101
 
@@ -221,14 +223,40 @@ def noted_curves(metadata: Mapping[str, str], name: str) -> dict[str, ClockCurve
         raise BuddylineError(f"{name}: its metadata {CURVES} cannot be read ({error})") from error
 
 
-def apart_problem(pair: tuple[str, str], offset_s: float, curves: Mapping[str, ClockCurve], at_ns: int) -> str:
-    """Say that a pair's clocks differ though curves were taken into account, what it does to poses, and what to do."""
+def apart_text(apart_s: Mapping[tuple[str, str], float]) -> str:
+    """Return by how much pairs' clocks are apart that their poses count, as a solved dive's metadata have it."""
+    return json.dumps([[*pair, offset_s] for pair, offset_s in apart_s.items()])
+
+
+def noted_apart(metadata: Mapping[str, str], name: str) -> dict[tuple[str, str], float]:
+    """Return what `apart_text` has noted; empty for nothing. name: the log's, for an error."""
+    try:
+        return {(str(a), str(b)): float(offset_s) for a, b, offset_s in json.loads(metadata.get(APART, "[]"))}
+    except (ValueError, TypeError) as error:
+        raise BuddylineError(f"{name}: its metadata {APART} cannot be read ({error})") from error
+
+
+def apart_problem(
+    pair: tuple[str, str], offset_s: float, curves: Mapping[str, ClockCurve], at_ns: int, *, counted: bool
+) -> str:
+    """Say that a pair's clocks differ though curves were taken into account, what it does to poses, and what to do.
+
+    counted: whether the poses count it.
+    """
     node_a, node_b = pair
+    ahead = "ahead of" if offset_s > 0.0 else "behind"
+    told = (
+        f"clock of {node_b} is {1e3 * abs(offset_s):.0f} ms {ahead} {node_a}'s: each pose is of pictures taken that "
+        "far apart"
+    )
+    if not counted:
+        return (
+            f"{told}, and off by what the nodes moved meanwhile, which its sigmas do not count; synchronise the "
+            "clocks, or solve with the whole dive's track, which tells the offset better, and whose poses count it"
+        )
     known_ns = [curves[node].offset_ns(at_ns) if node in curves else 0 for node in pair]
     whole_s = offset_s + (known_ns[1] - known_ns[0]) / S_NS
-    ahead = "ahead of" if offset_s > 0.0 else "behind"
     return (
-        f"clock of {node_b} is {1e3 * abs(offset_s):.0f} ms {ahead} {node_a}'s: each pose is of pictures taken that "
-        "far apart, and off by what the nodes moved meanwhile, which its sigmas do not count (the track's do); "
-        f"solve again with --nodes {node_a} {node_b} --clock-offset {whole_s:.4f} (align tells a drift too)"
+        f"{told}, which its sigmas count; to pair pictures that are nearer in time, synchronise the clocks, or solve "
+        f"again with --nodes {node_a} {node_b} --clock-offset {whole_s:.4f} (align tells a drift too)"
     )

@@ -25,7 +25,7 @@ from buddyline.tools.columns import (
     track_columns,
 )
 from buddyline.tools.dives import Dive
-from buddyline.tools.solve import is_replaced, messages_of, solved
+from buddyline.tools.solve import clocks_apart, is_replaced, messages_of, solved
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +67,14 @@ def solve_messages(
     settings = SolveConfig(method=method, checks=list(checks)).settings("solve_messages")
     if clocks is None:
         clocks = {chosen[1]: ClockCurve.constant(clock_offset_s or 0.0)}
-    core = SolverCore(settings, [chosen], clocks, track=track_settings(track, track_hz))
-    outcomes = list(solved(core, taken))
+
+    def outcomes_of(apart_s: Mapping[Pair, float]) -> tuple[SolverCore, list[Message]]:
+        core = SolverCore(settings, [chosen], clocks, apart_s=apart_s, track=track_settings(track, track_hz))
+        return core, list(solved(core, taken))
+
+    core, outcomes = outcomes_of({})
+    if apart_s := clocks_apart(core):
+        _, outcomes = outcomes_of(apart_s)
     rejected = sorted((one for one in outcomes if isinstance(one, Rejected)), key=lambda one: one.stamp_ns)
     return SolvedDive(
         chosen,

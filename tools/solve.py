@@ -25,9 +25,10 @@ from buddyline.protocol.topics import TRACK
 from buddyline.solver_service.clock_curve import ClockCurve
 from buddyline.solver_service.config import SolveConfig, node_ids, track_settings
 from buddyline.solver_service.core import SolverCore
-from buddyline.solver_service.pair_core import PairCore
+from buddyline.solver_service.geometry.trigger import Settings
+from buddyline.solver_service.pair_core import PairCore, PairId
 from buddyline.tools.authenticity import AUTHENTICITY, check_logs
-from buddyline.tools.clock_curves import CURVES, apart_problem, chosen_curves, curves_text
+from buddyline.tools.clock_curves import APART, CURVES, apart_problem, apart_text, chosen_curves, curves_text
 from buddyline.tools.dives import Dive, load_info
 from buddyline.tools.newfile import new_dive_log
 from buddyline.tools.option_values import node_files
@@ -50,12 +51,112 @@ PART_S: Final = 1.0
 COPIED = ("info", "candidates", "imu", "attitude", "depth", "mark", "truth", "light_truth", "net_truth")
 
 
+class _ClocksApartError(Exception):
+    """A dive was solved before its track had told how far its nodes' clocks are apart."""
+
+    def __init__(self, apart_s: dict[PairId, float]) -> None:
+        super().__init__()
+        self.apart_s = apart_s
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """A dive and how to solve it. lone: nodes of lamps alone, or of a camera alone: in the network, and in no pair."""
+
+    args: argparse.Namespace
+    dive: Dive
+    settings: Settings
+    nodes: list[str]
+    lone: list[str]
+    infos: dict[str, NodeInfo]
+    replaced: dict[str, NodeInfo]
+    curves: dict[str, ClockCurve]
+    attitudes: list[Envelope]
+
+    def solve(self, apart_s: dict[PairId, float]) -> _Run:
+        """Solve the dive and write the output.
+
+        apart_s: how far pairs' clocks are apart, empty where that is not known yet. Raises _ClocksApartError, and
+        writes nothing, if the tracks have told it then.
+        """
+        args, dive = self.args, self.dive
+        core = SolverCore(
+            self.settings,
+            [pair for pair in combinations(self.nodes, 2) if all(_is_full(self.infos[node]) for node in pair)],
+            self.curves,
+            apart_s=apart_s,
+            track=track_settings(args.track, args.track_hz),
+            lone=self.lone,
+        )
+        tracks = defaultdict[tuple[str, ...], Tracked](Tracked)
+        with new_dive_log(args.output, self._metadata(apart_s)) as writer:
+            for info in self.replaced.values():
+                core.handle(info)
+                writer.write_message(info, dive.start_ns)
+            envelopes = messages_of(
+                dive,
+                self.infos,
+                *dict.fromkeys([*self.nodes, *self.lone]),
+                detector=args.detector,
+                environment=args.environment,
+                doing="solve again" if apart_s else "solve",
+            )
+            if self.attitudes:
+                from buddyline.tools.attitudes import in_place_of
+
+                envelopes = in_place_of(envelopes, self.attitudes)
+            while together := list(islice(envelopes, TOGETHER)):
+                sound = [envelope for envelope in together if not is_replaced(envelope.message, self.replaced)]
+                for envelope in sound:
+                    writer.write(envelope.key, envelope.payload, envelope.time_ns, envelope.stamp_ns)
+                _write(writer, core.handle_many(envelope.message for envelope in sound), tracks)
+            _write(writer, core.finish(), tracks)
+            bad = dive.refused
+            if not apart_s and (found_s := clocks_apart(core)):
+                raise _ClocksApartError(found_s)
+            for pair in core.pairs.values():
+                # What the whole dive told: counts, the clocks' offset, problems. There is no diver left to advise.
+                problems = core.health.of_dive(pair.nodes)
+                status = pair.report(dive.end_ns, dive.end_ns, problems, bad, sorted(core.unused), over=True)
+                writer.write_message(_of_dive(status, pair), dive.end_ns)
+        problems_of = {pair: self._track_problems(one, apart_s) for pair, one in core.pairs.items()}
+        return _Run(core, tracks, problems_of, bad)
+
+    def _metadata(self, apart_s: dict[PairId, float]) -> dict[str, str]:
+        args, metadata = self.args, self.dive.metadata()
+        metadata |= {"command": "solve", "method": args.method, "checks": args.checks}
+        told = check_logs(self.dive.readers, args.authority)
+        metadata |= {AUTHENTICITY: "; ".join(told)} if told else {}
+        # A solved dive that is solved again may name the clocks of before.
+        metadata |= {CURVES: curves_text(self.curves)} if self.curves or CURVES in metadata else {}
+        return metadata | ({APART: apart_text(apart_s)} if apart_s or APART in metadata else {})
+
+    def _track_problems(self, pair: PairCore, apart_s: Mapping[PairId, float]) -> list[str]:
+        """Return the problems that a pair's track has told, and found in the dive."""
+        offset_s = _clocks_apart_s(pair)
+        problems = [*pair.tracker.problems] if pair.tracker is not None else []
+        if offset_s is not None:
+            middle_ns = (self.dive.start_ns + self.dive.end_ns) // 2
+            problems.append(apart_problem(pair.nodes, offset_s, self.curves, middle_ns, counted=pair.nodes in apart_s))
+        return problems
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """What solving a dive has given. bad: how many messages were refused."""
+
+    core: SolverCore
+    tracks: Mapping[tuple[str, ...], Tracked]
+    problems_of: Mapping[PairId, list[str]]
+    bad: int
+
+
 def run(args: argparse.Namespace) -> int:
     """Solve a dive; return 0, or 1 if no trigger was resolved."""
     settings = SolveConfig(method=args.method, checks=[check for check in args.checks.split(",") if check]).settings(
         "--checks"
     )
-    replaced = replacements(args.info)
+    replaced, began_s = replacements(args.info), time.monotonic()
     with Dive(args.dives) as dive:
         replaced |= placed(args.place, dive.infos() | replaced)
         nodes, infos = nodes_of(dive, args.nodes), dive.infos() | replaced
@@ -63,49 +164,16 @@ def run(args: argparse.Namespace) -> int:
         check_detector(dive, nodes, args.detector, args.environment)
         if len(nodes) > 2 and (args.clock_offset is not None or args.clocks is not None):
             raise ConfigError("--clock-offset and --clocks are of one pair; choose it with --nodes A B")
-        # Nodes of lamps alone, or of a camera alone, are in the network, and in no pair.
         lone = [node for node, info in infos.items() if not _is_full(info) and (node in nodes or not args.nodes)]
         curves = chosen_curves(dive, nodes, args.clock_offset, args.clocks)
-        core = SolverCore(
-            settings,
-            [pair for pair in combinations(nodes, 2) if all(_is_full(infos[node]) for node in pair)],
-            curves,
-            track=track_settings(args.track, args.track_hz),
-            lone=lone,
-        )
-        attitudes = _attitudes(dive, args, nodes)
-        began_s, tracks = time.monotonic(), defaultdict[tuple[str, ...], Tracked](Tracked)
-        metadata = dive.metadata() | {"command": "solve", "method": args.method, "checks": args.checks}
-        told = check_logs(dive.readers, args.authority)
-        metadata |= {AUTHENTICITY: "; ".join(told)} if told else {}
-        # A solved dive that is solved again may name the curves of before.
-        metadata |= {CURVES: curves_text(curves)} if curves or CURVES in metadata else {}
-        with new_dive_log(args.output, metadata) as writer:
-            for info in replaced.values():
-                core.handle(info)
-                writer.write_message(info, dive.start_ns)
-            wanted = dict.fromkeys([*nodes, *lone])
-            envelopes = messages_of(
-                dive, infos, *wanted, detector=args.detector, environment=args.environment, doing="solve"
-            )
-            if attitudes:
-                from buddyline.tools.attitudes import in_place_of
-
-                envelopes = in_place_of(envelopes, attitudes)
-            while together := list(islice(envelopes, TOGETHER)):
-                sound = [envelope for envelope in together if not is_replaced(envelope.message, replaced)]
-                for envelope in sound:
-                    writer.write(envelope.key, envelope.payload, envelope.time_ns, envelope.stamp_ns)
-                _write(writer, core.handle_many(envelope.message for envelope in sound), tracks)
-            _write(writer, core.finish(), tracks)
-            bad = dive.refused
-            for pair in core.pairs.values():
-                # What the whole dive told: counts, the clocks' offset, problems. There is no diver left to advise.
-                problems = core.health.of_dive(pair.nodes)
-                status = pair.report(dive.end_ns, dive.end_ns, problems, bad, sorted(core.unused), over=True)
-                writer.write_message(_of_dive(status, pair), dive.end_ns)
-            problems_of = {nodes: _track_problems(pair, curves, dive) for nodes, pair in core.pairs.items()}
-    _summarize(args, core, tracks, problems_of, bad, time.monotonic() - began_s)
+        job = _Job(args, dive, settings, nodes, lone, infos, replaced, curves, _attitudes(dive, args, nodes))
+        try:
+            done = job.solve({})
+        except _ClocksApartError as found:
+            log.info("clocks: the track has found them apart; solving again, with poses that count it")
+            done = job.solve(found.apart_s)
+    core = done.core
+    _summarize(args, core, done.tracks, done.problems_of, done.bad, time.monotonic() - began_s)
     if not core.counts.total():
         log.error("no trigger was resolved: the dive holds no candidates of %s", " or ".join(nodes))
     elif not core.matched:
@@ -114,6 +182,16 @@ def run(args: argparse.Namespace) -> int:
         why = ": are the logs of the same dive?" if one_rate else ""
         log.error("nodes %s have no trigger in common%s", " and ".join(nodes), why)
     return 0 if core.matched else 1
+
+
+def clocks_apart(core: SolverCore) -> dict[PairId, float]:
+    """Return how far the clocks of pairs are apart, B's minus A's, s, where whole dives' tracks have found it."""
+    found = {
+        nodes: _clocks_apart_s(pair)
+        for nodes, pair in core.pairs.items()
+        if pair.tracker is not None and pair.tracker.makes_whole
+    }
+    return {nodes: offset_s for nodes, offset_s in found.items() if offset_s is not None}
 
 
 def _of_dive(status: SolverStatus, pair: PairCore) -> SolverStatus:
@@ -128,15 +206,6 @@ def _clocks_apart_s(pair: PairCore) -> float | None:
     if clock is None or not clock[1] <= ADVISED_SIGMA_S:
         return None
     return clock[0] if abs(clock[0]) > max(CLOCKS_APART_S, CLOCK_SIGMAS * clock[1]) else None
-
-
-def _track_problems(pair: PairCore, curves: Mapping[str, ClockCurve], dive: Dive) -> list[str]:
-    """Return the problems that a pair's track has told, and found in the dive."""
-    offset_s = _clocks_apart_s(pair)
-    problems = [*pair.tracker.problems] if pair.tracker is not None else []
-    if offset_s is not None:
-        problems.append(apart_problem(pair.nodes, offset_s, curves, (dive.start_ns + dive.end_ns) // 2))
-    return problems
 
 
 def _is_full(info: NodeInfo) -> bool:
@@ -330,7 +399,7 @@ def _summarize(
     args: argparse.Namespace,
     core: SolverCore,
     tracks: Mapping[tuple[str, ...], Tracked],
-    problems_of: Mapping[tuple[str, str], list[str]],
+    problems_of: Mapping[PairId, list[str]],
     bad: int,
     took_s: float,
 ) -> None:

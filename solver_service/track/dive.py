@@ -96,15 +96,15 @@ class Smoothed:
         return cls([], clock_ns * 1e-9, math.inf, problems)
 
 
-def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]) -> Smoothed:
-    """Give the whole dive's track at outputs_ns.
+def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int], told_ns: int = 0) -> Smoothed:
+    """Give the whole dive's track at outputs_ns. told_ns: how far B's clock was told to be ahead; fixes count it.
 
     Where the pictures of both nodes tell different distances, their bars are taken for longer and shorter by half of
     that each, and the sigmas hold that one of them alone may be wrong.
     """
     a, b = until_one_ended((in_order(records[0]), in_order(records[1])))
     records, fixes, gap = (judged(parted(a)), judged(parted(b))), sorted(fixes, key=stamp_of), 0.0
-    first = _first_pass(records, fixes, 0)
+    first = _first_pass(records, fixes, told_ns)
     for _ in range(GAP_ROUNDS - 1):
         more = first.gap_beyond(gap)
         if not more:
@@ -117,8 +117,8 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
             for record, share in zip(records, (-0.5 * more, 0.5 * more), strict=True)
         )
         records = a, b
-        first = _first_pass(records, fixes, 0)
-    found = _of_first_pass(first, records, fixes, outputs_ns, 0, gap, again=True)
+        first = _first_pass(records, fixes, told_ns)
+    found = _of_first_pass(first, records, fixes, outputs_ns, told_ns, gap, again=True)
     names = [record.node.name for record in records]
     return replace(found, problems=[*found.problems, gap_words(gap, names)]) if gap else found
 

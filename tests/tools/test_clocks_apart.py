@@ -13,11 +13,20 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Candidates, LightTruth, NodeInfo, RelativePose, Truth
 from buddyline.solver_service.clock_curve import ClockCurve
 from buddyline.tools.cli import main
-from buddyline.tools.clock_curves import CURVES, apart_problem, curves_text, noted_curves
+from buddyline.tools.clock_curves import (
+    APART,
+    CURVES,
+    apart_problem,
+    apart_text,
+    curves_text,
+    noted_apart,
+    noted_curves,
+)
 from buddyline.tools.dives import Dive
 from buddyline.tools.evaluation.clocks import SimulatedClocks, take_ned_truths
 from buddyline.tools.evaluation.recorded import Recorded
 from buddyline.tools.monitor.summary import summarize
+from buddyline.tools.offline import solve_logs
 from msgspec.structs import replace
 
 START_NS = 1_764_000_000 * S_NS
@@ -50,17 +59,34 @@ def check_track(result):
     assert track["position_m"]["median"] < 0.01
 
 
-def test_a_track_that_found_the_clocks_itself_is_right(dive, tmp_path, capsys, caplog):
+def test_what_the_track_has_found_of_the_clocks_counts_for_poses_too(dive, tmp_path, capsys, caplog):
     result, warnings = evaluated(dive, tmp_path / "out.mcap", capsys, caplog)
     check_track(result)
-    # The poses are wrong by more than they state. Both commands say so, and what to do.
-    assert result["accuracy"]["nees6"]["mean"] / 6.0 > 3.0
+    # Both commands say so, and what to do.
     assert len(warnings) == 2
     for warning in warnings:
-        [ms] = re.findall(r"clock of b is (\d+) ms ahead of a's", warning)
+        [ms] = re.findall(r"clock of b is (\d+) ms ahead of a's: each pose .* which its sigmas count", warning)
         [s] = re.findall(r"solve again with --nodes a b --clock-offset (0\.\d{4}) ", warning)
         assert float(ms) == pytest.approx(301.5, abs=6.0)
         assert float(s) == pytest.approx(0.3015, abs=0.006)
+    assert result["accuracy"]["poses"] > 200
+    assert result["accuracy"]["wrong"] == 0
+    assert result["accuracy"]["nees6"]["mean"] / 6.0 < 1.4
+    # Stamps and triggers are those of the frames, as they were recorded.
+    with DiveLogReader(tmp_path / "out.mcap") as reader:
+        poses = [one for one in (record.open().message for record in reader.records()) if isinstance(one, RelativePose)]
+    assert max(abs(pose.skew_ns) for pose in poses) < S_NS // 50
+    assert {pose.trigger - round(pose.stamp_ns * 10 / S_NS) for pose in poses} == {0}
+    # The library gives what the command writes.
+    found = solve_logs([dive])
+    assert found.poses.stamp_ns.tolist() == sorted(pose.stamp_ns for pose in poses)
+
+
+def test_poses_of_a_live_track_do_not_count_its_clocks(dive, tmp_path, capsys, caplog):
+    """It knows them too late. Both commands say that the poses are off by more than they state."""
+    result, warnings = evaluated(dive, tmp_path / "out.mcap", capsys, caplog, "--track", "filter")
+    assert sum("which its sigmas do not count" in warning for warning in warnings) == 2
+    assert result["accuracy"]["nees6"]["mean"] / 6.0 > 3.0
 
 
 @pytest.mark.parametrize("drifts", [False, True])
@@ -100,10 +126,10 @@ def test_a_network_whose_clocks_differ_is_right(tmp_path, capsys):
 
 def test_what_is_still_apart_is_added_to_what_was_taken_into_account():
     curves = {"b": ClockCurve.constant(0.3), "c": ClockCurve.constant(-0.1)}
-    told = apart_problem(("a", "b"), -0.02, curves, START_NS)
+    told = apart_problem(("a", "b"), -0.02, curves, START_NS, counted=True)
     assert "clock of b is 20 ms behind a's" in told
     assert "--nodes a b --clock-offset 0.2800 " in told
-    assert "--nodes b c --clock-offset -0.3500 " in apart_problem(("b", "c"), 0.05, curves, START_NS)
+    assert "--nodes b c --clock-offset -0.3500 " in apart_problem(("b", "c"), 0.05, curves, START_NS, counted=True)
 
 
 @pytest.mark.parametrize(
@@ -157,3 +183,15 @@ def test_a_curve_of_many_points_is_noted_by_some_of_them():
 def test_a_note_that_does_not_fit_is_named(text):
     with pytest.raises(BuddylineError, match=r"dive\.mcap: its metadata clock_curves"):
         noted_curves({CURVES: text}, "dive.mcap")
+
+
+@pytest.mark.parametrize("text", ["{", "1", '[["a", 0.3]]', '[["a", "b", "x"]]'])
+def test_clocks_that_poses_count_and_that_are_noted_wrongly_are_named(text):
+    with pytest.raises(BuddylineError, match=r"dive\.mcap: its metadata clocks_apart"):
+        noted_apart({APART: text}, "dive.mcap")
+
+
+def test_clocks_that_poses_count_are_noted():
+    apart_s = {("a", "b"): 0.3, ("a", "c"): -0.125}
+    assert noted_apart({APART: apart_text(apart_s)}, "dive.mcap") == apart_s
+    assert noted_apart({}, "dive.mcap") == {}

@@ -37,7 +37,7 @@ from buddyline.protocol.topics import (
     Topic,
 )
 from buddyline.solver_service.clock_curve import ClockCurve
-from buddyline.tools.clock_curves import apart_problem, noted_curves
+from buddyline.tools.clock_curves import apart_problem, noted_apart, noted_curves
 from buddyline.tools.dives import Dive, open_each
 from buddyline.tools.evaluation.clocks import SimulatedClocks, take_ned_truths, take_onto_common_clock
 from buddyline.tools.evaluation.recorded import Recorded
@@ -128,7 +128,8 @@ def _clocks_apart(log: Dive, pair: Pair, curves: Mapping[str, ClockCurve]) -> li
     last = told[-1] if told else None
     if not isinstance(last, SolverStatus) or last.clock_skew_s is UNSET or abs(last.clock_skew_s) <= STATUS_APART_S:
         return []
-    return [f"{log.name}: {apart_problem(pair, last.clock_skew_s, curves, last.stamp_ns)}"]
+    counted = pair in noted_apart(log.metadata(), log.name)
+    return [f"{log.name}: {apart_problem(pair, last.clock_skew_s, curves, last.stamp_ns, counted=counted)}"]
 
 
 def load(paths: Sequence[str], truth_paths: Sequence[str] = (), pair: Pair | None = None) -> Recorded:
