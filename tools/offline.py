@@ -74,6 +74,8 @@ def solve_messages(
 
     core, outcomes = outcomes_of({})
     if apart_s := clocks_apart(core):
+        # What the first pass has made only takes memory now.
+        del core, outcomes
         _, outcomes = outcomes_of(apart_s)
     rejected = sorted((one for one in outcomes if isinstance(one, Rejected)), key=lambda one: one.stamp_ns)
     return SolvedDive(

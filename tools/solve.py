@@ -73,7 +73,16 @@ class _Job:
     curves: dict[str, ClockCurve]
     attitudes: list[Envelope]
 
-    def solve(self, apart_s: dict[PairId, float]) -> _Run:
+    def solve(self) -> _Run:
+        """Solve the dive and write the output; once more where its track finds the clocks apart."""
+        try:
+            return self._solve({})
+        except _ClocksApartError as found:
+            apart_s = found.apart_s
+        log.info("clocks: the track has found them apart; solving again, with poses that count it")
+        return self._solve(apart_s)
+
+    def _solve(self, apart_s: dict[PairId, float]) -> _Run:
         """Solve the dive and write the output.
 
         apart_s: how far pairs' clocks are apart, empty where that is not known yet. Raises _ClocksApartError, and
@@ -167,11 +176,7 @@ def run(args: argparse.Namespace) -> int:
         lone = [node for node, info in infos.items() if not _is_full(info) and (node in nodes or not args.nodes)]
         curves = chosen_curves(dive, nodes, args.clock_offset, args.clocks)
         job = _Job(args, dive, settings, nodes, lone, infos, replaced, curves, _attitudes(dive, args, nodes))
-        try:
-            done = job.solve({})
-        except _ClocksApartError as found:
-            log.info("clocks: the track has found them apart; solving again, with poses that count it")
-            done = job.solve(found.apart_s)
+        done = job.solve()
     core = done.core
     _summarize(args, core, done.tracks, done.problems_of, done.bad, time.monotonic() - began_s)
     if not core.counts.total():
