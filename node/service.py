@@ -200,7 +200,8 @@ class NodeService(Service):
         try:
             self.recorder.close()
         except RecordError as error:
-            log.error("%s: %s", self.name, error)
+            if self.failure is None or self.failure[1] is not error:
+                log.error("%s: %s", self.name, error)
             status = status or 2
         else:
             log.info("%s: log %s", self.name, self.recorder.path)
@@ -315,6 +316,9 @@ class NodeService(Service):
         report_s = time.monotonic() + REPORT_S
         while not self.stop.wait(LOOK_S):
             self.heartbeat()
+            if self.recorder.ended and self.recorder.error is not None:
+                # systemd starts the node again, with a new log.
+                self.fail("recorder", self.recorder.error)
             if time.monotonic() >= report_s:
                 report_s += REPORT_S
                 self.status_message = status = self.status()

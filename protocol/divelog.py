@@ -118,6 +118,11 @@ class DiveLogWriter:
         """Length of the file, without the unfinished chunk."""
         return self._file.tell()
 
+    @property
+    def removed(self) -> bool:
+        """Whether the file was deleted while it was written."""
+        return self._file.removed
+
     def write(
         self, key: str, payload: bytes, log_time_ns: int, publish_time_ns: int | None = None, schema: str = ""
     ) -> None:

@@ -20,6 +20,7 @@ class Spool:
 
     def __init__(self, path: Path) -> None:
         self.stuck = False
+        self._path = path
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         self._held: deque[bytes] = deque()
         self._held_bytes = 0
@@ -29,6 +30,16 @@ class Spool:
     def closed(self) -> bool:
         """Whether the file is closed."""
         return self._fd < 0
+
+    @property
+    def removed(self) -> bool:
+        """Whether the file was deleted, so that what is written can no longer be read by anyone."""
+        about = os.fstat(self._fd)
+        # Some file systems count no links at all.
+        try:
+            return about.st_nlink == 0 and not os.path.samestat(about, os.stat(self._path))
+        except OSError:
+            return True
 
     def tell(self) -> int:
         """Return the number of bytes written, including queued ones."""

@@ -180,6 +180,16 @@ def test_a_disk_that_runs_full_in_mid_dive_costs_no_candidates(tmp_path):
     assert process.wait_for("written again")
 
 
+def test_a_log_that_is_removed_ends_the_node_so_that_systemd_begins_another(tmp_path):
+    with node(tmp_path, tmp_path / "dives") as (process, manager, _status):
+        manager.hear_until(fed)
+        shutil.rmtree(tmp_path / "dives")
+        assert process.wait() == 2
+        (said,) = [line for line in process.lines if "was removed while it was written" in line]
+        assert "start again" in said
+        assert not [line for line in process.lines if "Traceback" in line]
+
+
 def test_a_read_only_disk_is_refused_at_the_start_in_one_line(tmp_path):
     with (
         small_disk(tmp_path / "disk", 64, "ro") as disk,

@@ -14,7 +14,6 @@ from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter, read_logs
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CompressedImage, Depth, FoxgloveTime
 from buddyline.protocol.recorder import Recorder
-from buddyline.protocol.topics import parse_key
 from mcap.reader import make_reader
 
 TICK_NS = 100_000_000
@@ -275,17 +274,13 @@ def test_the_recorder_writes_everything_and_names_the_file_that_failed(tmp_path)
 
 def test_the_recorder_drops_pictures_before_candidates(tmp_path, monkeypatch):
     monkeypatch.setattr("buddyline.protocol.recorder.MAX_QUEUED_BYTES", 1000)
-    with Recorder(tmp_path / "a.mcap") as recorder:
-        with recorder._ready:  # the writing thread cannot take anything meanwhile
-            for i in range(8):
-                recorder._queue.append(("buddyline/node/a/image", bytes(200), i, ""))
-                recorder._queue.append(("buddyline/node/a/depth", b'{"stamp_ns":%d}' % i, i, ""))
-                recorder._queued_bytes += 200 + len(recorder._queue[-1][1])
-            while recorder._queued_bytes > 1000:
-                recorder._drop_one()
-            kinds = [parse_key(item[0])[0].name for item in recorder._queue]
-        assert kinds.count("depth") == 8
-        assert kinds.count("image") == 4
+    # The writing thread cannot take anything meanwhile.
+    with Recorder(tmp_path / "a.mcap") as recorder, recorder._ready:
+        for i in range(8):
+            recorder.write("buddyline/node/a/image", bytes(200), i)
+            recorder.write("buddyline/node/a/depth", b'{"stamp_ns":%d}' % i, i)
+        assert len(recorder._messages) == 8
+        assert len(recorder._pictures) == 4
     assert recorder.dropped == 4
 
 

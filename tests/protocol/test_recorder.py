@@ -201,9 +201,52 @@ def test_memory_is_bounded_and_pictures_are_dropped_before_messages(tmp_path, mo
         sender.depth()
     sender.picture(15_000)
     assert recorder.dropped == 3
-    assert [item[2] for item in recorder._queue if item[0] == DEPTH] == sender.depths
+    until(lambda: [item[2] for item in recorder._messages] == sender.depths)
     with pytest.raises(RecordError):
         recorder.close()
+
+
+def test_in_a_long_queue_the_oldest_is_dropped_without_a_search(tmp_path, monkeypatch):
+    looked_at = []
+    plain = module._is_picture
+
+    def look(key):
+        looked_at.append(key)
+        return plain(key)
+
+    with recording(tmp_path / "a-1.mcap") as recorder, recorder._ready:  # the writing thread waits meanwhile
+        sender = NumberedSender(recorder)
+        for _ in range(500):
+            sender.depth()
+        monkeypatch.setattr(module, "MAX_QUEUED_BYTES", recorder._queued_bytes)
+        monkeypatch.setattr(module, "_is_picture", look)
+        for _ in range(100):
+            sender.depth()
+        assert recorder.dropped >= 100
+        assert len(looked_at) == 100
+
+
+def test_a_log_that_is_deleted_while_it_is_written_is_an_error(tmp_path):
+    path = tmp_path / "a-1.mcap"
+    recorder = recording(path)
+    sender = NumberedSender(recorder)
+    sender.depth()
+    until(lambda: path.stat().st_size > 0 and stamps(path, DEPTH) == [1])
+    path.unlink()
+    until(lambda: recorder.ended)
+    with pytest.raises(RecordError, match=r"a-1\.mcap: was removed while it was written, .*; start again"):
+        recorder.close()
+
+
+def test_a_log_that_is_renamed_while_it_is_written_is_whole(tmp_path):
+    path, renamed = tmp_path / "a-1.mcap", tmp_path / "kept.mcap"
+    with recording(path) as recorder:
+        sender = NumberedSender(recorder)
+        sender.depth()
+        until(lambda: path.stat().st_size > 0 and stamps(path, DEPTH) == [1])
+        path.rename(renamed)
+        sender.depth()
+    assert stamps(renamed, DEPTH) == [1, 2]
 
 
 def test_what_is_being_written_counts_among_what_waits(tmp_path, monkeypatch):
