@@ -9,12 +9,11 @@ import sys
 import threading
 import time
 from collections import Counter, deque
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol.digest import end_of
 from buddyline.protocol.digest_check import Discrepancy
-from buddyline.protocol.recorder import Recorder
+from buddyline.protocol.recorder import Recorder, RecordError
 from buddyline.protocol.topics import DIGEST, EVERYTHING, parse_key
 from buddyline.tools.authenticity import digest_check, report
 from buddyline.tools.client import client_config
@@ -35,13 +34,23 @@ LOOK_S: Final = 0.5
 RATE_LOOKS: Final = 8
 
 
-def progress_words(then: Counter[str], now: Counter[str], seconds: float, free_bytes: int, width: int) -> str:
+def free_words(recorder: Recorder) -> str:
+    """Return what the log's disk still takes, or why it takes nothing."""
+    if recorder.error is not None:
+        return f"not written: {recorder.error}"
+    try:
+        return f"{shutil.disk_usage(recorder.path.absolute().parent).free / 1e9:.1f} GB free"
+    except OSError as error:
+        return f"its disk cannot be reached: {error.strerror}"
+
+
+def progress_words(then: Counter[str], now: Counter[str], seconds: float, free: str, width: int) -> str:
     """Return what has been recorded, what the disk still takes, and each topic's rate: as many as fit into width.
 
-    then, now: messages of each topic, seconds apart.
+    then, now: messages of each topic, seconds apart. free: what the disk takes, in words.
     """
     total = f"{(now.total() - then.total()) / seconds:.0f} a second"
-    words = f"{now.total()} messages, {free_bytes / 1e9:.1f} GB free, {total}"
+    words = f"{now.total()} messages, {free}, {total}"[: max(width - 1, 0)]
     for k, (name, count) in enumerate(now.most_common()):
         more = f"{', ' if k else ': '}{name} {(count - then[name]) / seconds:.0f}"
         if len(words + more) >= width:
@@ -54,42 +63,61 @@ def run(args: argparse.Namespace) -> int:
     """Record until stopped."""
     config = client_config(args)
     client = LiveClient("record", config, args.seconds)
-    with Recorder(args.output, metadata={"command": "record"}) as recorder:
-        recording = Recording(recorder, None if config.tls is None else config.tls.ca)
+    recorder = Recorder(args.output, metadata={"command": "record"})
+    recording = Recording(recorder, None if config.tls is None else config.tls.ca)
 
-        def record(bus: Bus) -> None:
-            filler = Filler(bus, recording.fill, bus.clock.now_ns(), client.stop)
-            recording.filler = filler
-            subscription = follow(bus, EVERYTHING, client.refusals, recording.take, capacity=65536)
-            filling = client.spawn("fill", filler.run)
-            log.info("record: %s into %s; Ctrl-C ends", client.config.connect, args.output)
-            looks = deque([(time.monotonic(), recording.counted())], RATE_LOOKS)
-            while not client.stop.wait(LOOK_S):
-                if recorder.error is not None:
-                    client.fail("recorder", recorder.error)
-                if sys.stderr.isatty():
-                    looks.append((time.monotonic(), recording.counted()))
-                    (then_s, then), (now_s, now) = looks[0], looks[-1]
-                    free_bytes = shutil.disk_usage(Path(args.output).absolute().parent).free
-                    words = progress_words(then, now, now_s - then_s, free_bytes, terminal_size().columns)
-                    print(f"\r{words}\x1b[K", end="", file=sys.stderr, flush=True)
+    def record(bus: Bus) -> None:
+        filler = Filler(bus, recording.fill, bus.clock.now_ns(), client.stop)
+        recording.filler = filler
+        subscription = follow(bus, EVERYTHING, client.refusals, recording.take, capacity=65536)
+        filling = client.spawn("fill", filler.run)
+        log.info("record: %s into %s; Ctrl-C ends", client.config.connect, args.output)
+        looks = deque([(time.monotonic(), recording.counted())], RATE_LOOKS)
+        while not client.stop.wait(LOOK_S):
+            if recorder.ended and recorder.error is not None:
+                client.fail("recorder", recorder.error)
             if sys.stderr.isatty():
-                print("\r\x1b[K", end="", file=sys.stderr, flush=True)
-            bus.close()
-            # The bus has taken its question back.
-            filling.join()
-            recording.dropped = subscription.dropped + subscription.missed
+                looks.append((time.monotonic(), recording.counted()))
+                (then_s, then), (now_s, now) = looks[0], looks[-1]
+                words = progress_words(then, now, now_s - then_s, free_words(recorder), terminal_size().columns)
+                print(f"\r{words}\x1b[K", end="", file=sys.stderr, flush=True)
+        if sys.stderr.isatty():
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+        bus.close()
+        # The bus has taken its question back.
+        filling.join()
+        recording.dropped = subscription.dropped + subscription.missed
 
+    try:
         status = client.run(record)
+    finally:
+        written = _close(recorder, client)
+        if not recording.counts:
+            # There is nothing in it, and the next recording may have its name.
+            recorder.path.unlink(missing_ok=True)
     recording.report(args.output)
     dropped = recording.dropped + recorder.dropped
+    nothing = "" if recording.counts else "; nothing came, so no log is left"
     print(
-        f"{args.output}: {recording.counts.total()} messages, {dropped} dropped, {client.refusals.count} bad",
+        f"{args.output}: {recording.counts.total()} messages, {dropped} dropped, {client.refusals.count} bad{nothing}",
         file=sys.stderr,
     )
     for name, count in sorted(recording.counts.items()):
         print(f"  {count:8d} {name}", file=sys.stderr)
-    return status
+    if not written:
+        return 2
+    return status if recording.counts else status or 1
+
+
+def _close(recorder: Recorder, client: LiveClient) -> bool:
+    """Write the log's end; return whether all of the log is on the disk, and say why if not."""
+    try:
+        recorder.close()
+    except RecordError as error:
+        if client.failure is None or client.failure[1] is not error:
+            log.error("record: %s", error)
+        return False
+    return True
 
 
 class Recording:

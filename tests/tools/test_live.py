@@ -37,6 +37,9 @@ def test_a_command_without_a_hub_ends_when_its_time_is_over(tmp_path, words):
     done = buddyline(*words, "--connect", endpoint, "--seconds", "0.5", cwd=tmp_path)
     assert done.returncode == 2, done.stderr
     assert f"no hub at {endpoint} within 0.5 s" in done.stderr
+    if words[0] == "record":
+        assert "out.mcap: 0 messages, 0 dropped, 0 bad; nothing came, so no log is left" in done.stderr
+        assert not list(tmp_path.iterdir())
 
 
 def test_ctrl_c_ends_the_wait_for_a_hub(tmp_path):

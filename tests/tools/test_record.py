@@ -1,4 +1,4 @@
-"""`record`: what it says on a terminal."""
+"""`record`: what it says on a terminal, and what it does when its disk or its file fails."""
 
 from __future__ import annotations
 
@@ -12,24 +12,27 @@ import sys
 import termios
 import threading
 from collections import Counter
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
+from buddyline.protocol.divelog import DiveLogReader
 from buddyline.protocol.topics import DEPTH
 from buddyline.protocol.zenoh_bus import connect, open_hub
 from buddyline.tools.record import progress_words
 
-from tests.processes import PATIENCE_S, REPOSITORY, free_endpoint
+from tests.disks import small_disk
+from tests.processes import PATIENCE_S, REPOSITORY, Process, free_endpoint, until
 from tests.tools.watched import at, depth
 
 
 def test_rates_of_topics_are_said_as_far_as_they_fit() -> None:
     then, now = Counter(imu=100, depth=10), Counter(imu=500, depth=10, candidates=40)
-    assert progress_words(then, now, 2.0, 53_400_000_000, 200) == (
+    assert progress_words(then, now, 2.0, "53.4 GB free", 200) == (
         "550 messages, 53.4 GB free, 220 a second: imu 200, candidates 20, depth 0"
     )
-    assert progress_words(then, now, 2.0, 53_400_000_000, 60) == "550 messages, 53.4 GB free, 220 a second: imu 200"
+    assert progress_words(then, now, 2.0, "53.4 GB free", 60) == "550 messages, 53.4 GB free, 220 a second: imu 200"
 
 
 def test_its_line_fits_the_terminal_and_is_gone_before_the_summary(tmp_path: Path) -> None:
@@ -73,3 +76,77 @@ def test_its_line_fits_the_terminal_and_is_gone_before_the_summary(tmp_path: Pat
     assert lines
     assert max(map(len, lines)) < 60
     assert f"\r\x1b[K{tmp_path / 'rec.mcap'}: " in said
+
+
+class Published:
+    """Sends depths, one after the other."""
+
+    def __init__(self, endpoint: str) -> None:
+        bus = connect(endpoint, stop=threading.Event(), on_wait=lambda _: None)
+        assert bus is not None
+        self.bus, self._publisher, self.count = bus, bus.publisher(DEPTH, "a"), 0
+
+    def put(self) -> None:
+        self._publisher.put(depth("a", at(self.count), 12.5))
+        self.count += 1
+
+
+@contextmanager
+def recorded(path: Path) -> Iterator[tuple[Process, Published]]:
+    """Run `record` into path on a hub of its own."""
+    endpoint = free_endpoint()
+    with open_hub(endpoint), Process("record", path, "--connect", endpoint) as record:
+        record.wait_for("Ctrl-C ends")
+        published = Published(endpoint)
+        try:
+            yield record, published
+        finally:
+            published.bus.close()
+
+
+def put_until(published: Published, record: Process, text: str) -> None:
+    def found() -> bool:
+        published.put()
+        return any(text in line for line in record.lines)
+
+    until(found)
+
+
+def test_a_full_disk_is_named_and_nothing_is_lost_once_there_is_room(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk", 512) as disk, recorded(disk / "out.mcap") as (record, published):
+        ballast = disk / "ballast"
+        with suppress(OSError), ballast.open("wb", buffering=0) as file:
+            while True:
+                file.write(bytes(4096))
+        put_until(published, record, "out.mcap: No space left on device; kept in memory")
+        ballast.unlink()
+        put_until(published, record, "written again; nothing of it is lost")
+        record.send(signal.SIGINT)
+        assert record.wait() == 130
+        summary = next(line for line in record.lines if "messages, " in line)
+        with DiveLogReader(disk / "out.mcap") as reader:
+            stored = len(list(reader.records()))
+        assert f"{stored} messages, 0 dropped, 0 bad" in summary
+
+
+def test_a_disk_that_stays_full_is_one_line_and_status_2(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk", 512) as disk, recorded(disk / "out.mcap") as (record, published):
+        with suppress(OSError), (disk / "ballast").open("wb", buffering=0) as file:
+            while True:
+                file.write(bytes(4096))
+        put_until(published, record, "No space left on device")
+        record.send(signal.SIGINT)
+        assert record.wait() == 2
+        said = "\n".join(record.lines)
+        assert "its end is lost: No space left on device" in said
+        assert "Traceback" not in said
+        assert "messages, " in said
+
+
+def test_a_log_that_is_deleted_meanwhile_ends_the_recording(tmp_path: Path) -> None:
+    with recorded(tmp_path / "out.mcap") as (record, published):
+        until((tmp_path / "out.mcap").exists)
+        (tmp_path / "out.mcap").unlink()
+        put_until(published, record, "out.mcap: was removed while it was written")
+        assert record.wait() == 2
+        assert sum("was removed" in line for line in record.lines) == 1
