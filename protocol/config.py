@@ -18,6 +18,8 @@ from buddyline.protocol.refused import field_of, value_at, without_field
 C = TypeVar("C", bound=msgspec.Struct)
 # Text longer than this is a large survey's: there rtoml, where it is installed, takes a sixth of tomllib's time.
 LONG: Final = 100_000
+# What a dive log begins with.
+MCAP: Final = b"\x89MCAP"
 
 
 class ConfigError(BuddylineError):
@@ -33,12 +35,24 @@ def load_config(path: Path | str, schema: type[C]) -> C:
     path = Path(path)
     try:
         # Editors of Windows may put a byte order mark before the text.
-        text = path.read_text(encoding="utf-8-sig")
+        content = path.read_bytes()
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    text = text_of(content, path, "a configuration in TOML")
+    return parse_config(text.replace("\r\n", "\n").replace("\r", "\n"), schema, str(path))
+
+
+def text_of(content: bytes, path: Path | str, wanted: str) -> str:
+    """Return a file's text; raise ConfigError that says where it is none, and what is wanted in its place."""
+    if content.startswith(MCAP):
+        raise ConfigError(f"{path}: is a dive log; name {wanted} here")
+    try:
+        return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: is not UTF-8 text: {error}") from error
-    return parse_config(text, schema, str(path))
+        line = content.count(b"\n", 0, error.start) + 1
+        raise ConfigError(
+            f"{path}: byte 0x{content[error.start]:02x} in line {line} is not UTF-8 text; name {wanted}, saved as UTF-8"
+        ) from error
 
 
 def parse_config(text: str, schema: type[C], name: str) -> C:

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.config import ConfigError
+from buddyline.protocol.config import ConfigError, text_of
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import ClockBeacon, HeardClock
 from buddyline.protocol.topics import CLOCK
@@ -189,12 +189,16 @@ def chosen_curves(
 def load_curve(path: str, pair: tuple[str, str], dive: Dive) -> ClockCurve:
     """Read a pair's clocks from a file of `buddyline align --json`; raise ConfigError naming the file."""
     try:
-        told = json.loads(Path(path).read_text())
+        told = json.loads(text_of(Path(path).read_bytes(), f"--clocks {path}", "what `buddyline align --json` writes"))
         a, b = told["node_a"], told["node_b"]
         offset_s, drift, at_ns = float(told["offset_s"]), float(told.get("drift") or 0.0), int(told.get("at_ns") or 0)
     except OSError as error:
         raise ConfigError(f"--clocks {path}: cannot be read: {error.strerror}") from error
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except KeyError as error:
+        raise ConfigError(
+            f"--clocks {path}: is not what `buddyline align --json` writes (it has no {error.args[0]})"
+        ) from error
+    except (ValueError, TypeError, AttributeError) as error:
         raise ConfigError(f"--clocks {path}: is not what `buddyline align --json` writes ({error})") from error
     if (a, b) != pair:
         raise ConfigError(f"--clocks {path}: is of nodes {a} and {b}, not of {pair[0]} and {pair[1]}")

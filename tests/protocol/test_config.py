@@ -52,6 +52,28 @@ def test_a_missing_configuration_is_named(tmp_path):
         load_config(tmp_path / "none.toml", NodeConfig)
 
 
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"\x89MCAP0\r\nlog", "a.toml: is a dive log; name a configuration in TOML here"),
+        (
+            b'node = "a"\nconnect = "\xe9"\n',
+            "a.toml: byte 0xe9 in line 2 is not UTF-8 text; name a configuration in TOML, saved as UTF-8",
+        ),
+    ],
+)
+def test_a_file_that_is_no_text_is_named_with_what_is_wanted(tmp_path, content, says):
+    (tmp_path / "a.toml").write_bytes(content)
+    with pytest.raises(ConfigError) as refused:
+        load_config(tmp_path / "a.toml", NodeConfig)
+    assert str(refused.value) == f"{tmp_path}/{says}"
+
+
+def test_lines_may_end_as_on_windows(tmp_path):
+    (tmp_path / "a.toml").write_bytes(b'\xef\xbb\xbfnode = "a"\r\nrate_hz = 5.0\r\n')
+    assert load_config(tmp_path / "a.toml", NodeConfig).rate_hz == 5.0
+
+
 def test_defaults_apply_and_change_the_hash_when_overridden():
     config = parse_config('node = "a"', NodeConfig, "a.toml")
     assert config.camera.name == "simulated"

@@ -210,12 +210,20 @@ def test_a_dive_without_a_link_gives_the_offset_to_solve_with():
     [
         ([], "no node's clock was heard"),
         ([m for m in beacons() if m.node == "a"], "only node a's clock"),
-        (beacons(seconds=1.0), "did not hear each other long enough"),
+        (beacons(seconds=1.0), "a, b did not hear each other long enough"),
     ],
 )
 def test_nothing_to_compare_is_an_error_that_says_what_to_do(said, words):
     with pytest.raises(BuddylineError, match=words):
         reports(heard_of(said), None)
+    # Of logs, it names them, and what else tells the offset.
+    with pytest.raises(BuddylineError, match=rf"^a\.mcap, b\.mcap: .*{words}.*`buddyline align`"):
+        reports(heard_of(said), None, ["a.mcap", "b.mcap"])
+
+
+def test_a_node_that_was_not_heard_is_named():
+    with pytest.raises(BuddylineError, match=r"--nodes a x: the clock of node x was not heard, but those of"):
+        reports(heard_of(beacons()), ["a", "x"])
 
 
 def test_a_node_that_becomes_silent_meanwhile_is_named(monkeypatch):

@@ -165,10 +165,12 @@ def test_solve_takes_the_clock_from_the_beacons_or_from_a_file(drifted, tmp_path
         ("{", "is not what `buddyline align --json` writes"),
         ('{"node_a": "b", "node_b": "a", "offset_s": 0.1}', "is of nodes b and a, not of a and b"),
         ("[]", "is not what"),
+        ("{}", "is not what `buddyline align --json` writes (it has no node_a)"),
+        ("\x89MCAP0", "clocks.json: is a dive log; name what `buddyline align --json` writes here"),
     ],
 )
 def test_a_file_that_does_not_fit_is_refused(drifted, tmp_path, capsys, told, words):
-    (tmp_path / "clocks.json").write_text(told)
+    (tmp_path / "clocks.json").write_text(told, encoding="latin-1")
     logs = [str(drifted / "a.mcap"), str(drifted / "b.mcap")]
     assert main(["solve", *logs, "-o", str(tmp_path / "o.mcap"), "--clocks", str(tmp_path / "clocks.json")]) == 2
     assert words in capsys.readouterr().err

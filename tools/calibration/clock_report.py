@@ -6,7 +6,7 @@ import json
 import logging
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
@@ -121,8 +121,11 @@ class Report:
         return ""
 
 
-def reports(heard: Heard, nodes: list[str] | None) -> list[Report]:
-    """Compare the clocks of each pair; raise BuddylineError if there is none. nodes: one pair; None: all."""
+def reports(heard: Heard, nodes: list[str] | None, logs: Sequence[str] = ()) -> list[Report]:
+    """Compare the clocks of each pair; raise BuddylineError if there is none.
+
+    nodes: one pair; None: all. logs: where it was heard; none: on the bus.
+    """
     pairs = heard.ways.pairs() if nodes is None else [(nodes[0], nodes[1])]
     found = []
     for a, b in pairs:
@@ -133,13 +136,20 @@ def reports(heard: Heard, nodes: list[str] | None) -> list[Report]:
     if found:
         return found
     present = sorted(heard.last_s)
+    where = f"{', '.join(logs)}: " if logs else ""
+    both = "name the logs that both nodes wrote" if logs else "start both nodes"
+    itself = "after a dive in which they moved, `buddyline align` finds the offset from the dive itself"
     if not present:
-        raise BuddylineError("no node's clock was heard: start both nodes, and with logs give both nodes' own")
+        raise BuddylineError(f"{where}no node's clock was heard: {both}; {itself}")
     if len(present) == 1:
-        raise BuddylineError(f"only node {present[0]}'s clock was heard: it takes two nodes, or both nodes' logs")
+        raise BuddylineError(f"{where}only node {present[0]}'s clock was heard: {both}; {itself}")
+    if nodes is not None and (unknown := [node for node in nodes if node not in present]):
+        raise BuddylineError(
+            f"{where}--nodes {' '.join(nodes)}: the clock of node {unknown[0]} was not heard, but those of nodes "
+            f"{', '.join(present)}"
+        )
     raise BuddylineError(
-        f"nodes {', '.join(present)} did not hear each other long enough to compare their clocks; after a dive in "
-        "which they moved, `buddyline align` finds the offset from the dive itself"
+        f"{where}nodes {', '.join(present)} did not hear each other long enough to compare their clocks; {itself}"
     )
 
 

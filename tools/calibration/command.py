@@ -305,7 +305,7 @@ def _clock(args: argparse.Namespace) -> int:
     if not 3.0 <= args.seconds <= 3600.0:
         raise BuddylineError(f"--seconds {args.seconds:g}: 3 to 3600")
     heard = read(args.dives) if args.dives else listen(client_config(args), args.seconds)
-    found = reports(heard, args.nodes)
+    found = reports(heard, args.nodes, args.dives)
     print(as_json(found, heard) if args.json else as_text(found, heard))
     # After a dive the clocks need not agree: their offset only has to be known.
     return 0 if args.dives else int(any(one.problem() for one in found))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, get_args
 
 import msgspec
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.config import ConfigError
+from buddyline.protocol.config import ConfigError, text_of
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Mark
 from buddyline.tools.survey.project import HandMark, MarkKind, Station, check_mark
@@ -96,12 +96,10 @@ def of_table(path: Path, dives: int = 1) -> list[HandMark]:
     Raises ConfigError naming file, line and value. dives: how many there are.
     """
     try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            text = file.read()
+        content = path.read_bytes()
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: is not UTF-8 text: {error}") from error
+    text = text_of(content, path, "a table of marks as CSV")
     # Spreadsheets write semicolons or tabs where a comma is the decimal point.
     head = text.partition("\n")[0]
     delimiter = max(",;\t", key=head.count)
