@@ -52,6 +52,8 @@ from buddyline.solver_service.track_messages import (
 
 # For how long after its stamp an expectation serves: its sigma has grown to a large part of the picture by then.
 EXPECT_VALID_NS: Final = S_NS // 2
+# A start takes about as many triggers before it is sure of itself.
+FEW: Final = 5
 
 
 @dataclass(frozen=True)
@@ -142,8 +144,9 @@ class PairTracker:
         self._oriented = self._idle = False
         self._fixed_ns = -REST_NS
         self._clock: tuple[float, float] | None = None
-        # Whether there was a pose; whether the nodes look apart and never had one; the triggers of then, with stamps.
-        self._posed = self._rests = False
+        # How many poses there were; whether both nodes had a picture of a trigger; whether the nodes look apart and
+        # never had a pose; the triggers of then, with stamps.
+        self._posed, self._met, self._rests = 0, False, False
         self._unseen: dict[int, int] = {}
 
     @property
@@ -292,7 +295,8 @@ class PairTracker:
             self._idle = False
         self._settled_ns = max(self._settled_ns, *stamps_ns)
         for one in outcomes:
-            self._posed |= isinstance(one, RelativePose)
+            self._posed += isinstance(one, RelativePose)
+            self._met |= not (isinstance(one, Rejected) and one.reason == "unmatched")
             if isinstance(one, Rejected) and not self._posed:
                 apart = one.detail == LOOK_APART
                 # One in LOOKS triggers is solved also of nodes that look apart; one of a single frame tells nothing.
@@ -316,17 +320,25 @@ class PairTracker:
         """
         # Later rows would only be guessed. The filter holds back what is within HOLD_S of the end.
         heard_ns = max(stream.heard_ns for stream in self._streams) + round(2.0 * HOLD_S * S_NS)
-        posed = self._posed
+        posed, met = self._posed, self._met
         told = self._end(min(self._settled_ns + S_NS, heard_ns))
         if not (self._made or self._stopped or present(self.problems)):
-            self._note([self._why_none(posed=posed)])
+            self._note([self._why_none(posed, met=met)])
         return told
 
-    def _why_none(self, *, posed: bool) -> str:
-        """Say why a dive has no track, where nothing is wrong with its messages. posed: whether it has a pose."""
+    def _why_none(self, posed: int, *, met: bool) -> str:
+        """Say why a dive has no track, where nothing is wrong with its messages.
+
+        posed: how many poses it has. met: whether a trigger has pictures of both nodes.
+        """
         a, b = self._streams
+        if not met:
+            return f"no track: no trigger has pictures of both {a.node} and {b.node}"
         if posed and a.attitude.newest_ns is None and a.imu.newest_ns is None:
             return f"no track: node {a.node} told neither attitudes nor inertial samples, so a pose starts none"
+        if 0 < posed < FEW:
+            what = "one pose is" if posed == 1 else f"{posed} poses are"
+            return f"no track: {what} too few to start one; name logs of more seconds in which both saw each other"
         if posed:
             return "no track: the lights after each pose do not agree with a start from it"
         without = [stream.node for stream in (a, b) if stream.attitude.newest_ns is None]

@@ -277,6 +277,29 @@ def test_a_dive_without_a_track_says_why(mode, seen, told, said):
     assert pair.report(0, 0, [], 0, [], over=True).problem.endswith(said)
 
 
+@pytest.mark.parametrize("mode", ["smooth", "filter"])
+@pytest.mark.parametrize(
+    ("b_from", "said"),
+    [
+        (15, "no track: no trigger has pictures of both a and b"),
+        (14, "no track: one pose is too few to start one; name logs of more seconds in which both saw each other"),
+    ],
+)
+def test_nodes_that_hardly_told_at_the_same_time_are_named_as_such(mode, b_from, said):
+    """a tells its first 15 triggers, b those from b_from on."""
+    messages = dive_messages(seconds=3.0)[0]
+    first = min(one.trigger for one in messages if isinstance(one, Candidates))
+    kept = [
+        one
+        for one in messages
+        if not isinstance(one, Candidates)
+        or (one.trigger - first < 15 if one.node == "a" else one.trigger - first >= b_from)
+    ]
+    tracks, solver = tracks_of(kept, mode)
+    assert tracks == []
+    assert solver.pairs["a", "b"].tracker.problems == [said]
+
+
 def test_the_status_of_a_whole_dive_names_problems_that_ended_before_it_did(inertial_dive):
     start_ns = inertial_dive[0][0].stamp_ns
     in_g = [
