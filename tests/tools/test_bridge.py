@@ -73,6 +73,7 @@ def test_a_vehicle_on_a_real_hub_reaches_autopilot_plotter_and_program() -> None
     [
         ((), "bridge: give --mavlink, --nmea or --http"),
         (("--nmea", "nowhere"), "--nmea nowhere: give HOST:PORT"),
+        (("--nmea", "a..b:10110"), "--nmea a..b:10110: no host can have this name; give HOST:PORT"),
         (("--http", "127.0.0.1:8", "--messages", "all"), "--messages all"),
         (("--http", "127.0.0.1:8", "--messages", "gps"), "needs --place or --boat"),
         (("--http", "127.0.0.1:8", "--place", "95,1"), "--place 95,1"),

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import re
 import shutil
+import socket
+import struct
 import subprocess
 import urllib.error
 import urllib.request
@@ -54,6 +56,39 @@ class TestHttp:
         self.now_ns += S_NS
         assert get(f"{path}/acoustic/filtered")["position_valid"] is False
         assert get(f"{path}/global")["fix_quality"] == 0
+
+    def test_a_place_from_before_this_machine_s_clock_was_set_back_is_not_valid(
+        self, served: tuple[Answers, str]
+    ) -> None:
+        state, address = served
+        state.place(placed_of(declination_rad=0.0), None, None)
+        self.now_ns -= 3600 * S_NS
+        assert get(f"{address}/api/v1/position/acoustic/filtered")["position_valid"] is False
+
+    def test_a_client_that_goes_in_mid_answer_is_no_fault(
+        self, served: tuple[Answers, str], capfd: pytest.CaptureFixture[str]
+    ) -> None:
+        _, address = served
+        host, _, port = address.removeprefix("http://").rpartition(":")
+        for _ in range(20):
+            with socket.create_connection((host, int(port))) as client:
+                client.sendall(b"GET /api/v1/about HTTP/1.1\r\n")
+                # Closed with a reset.
+                client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        assert get(f"{address}/api/v1/about")["product"] == "Buddyline"
+        assert "Traceback" not in capfd.readouterr().err
+
+    def test_it_serves_over_ipv6(self) -> None:
+        try:
+            with socket.socket(socket.AF_INET6) as probe:
+                probe.bind(("::1", 0))
+        except OSError as error:
+            pytest.skip(f"this machine has no IPv6: {error}")
+        api = HttpApi("::1", 0, Answers(lambda: at(5)))
+        try:
+            assert get(f"http://[::1]:{api.port}/api/v1/about")["product"] == "Buddyline"
+        finally:
+            api.close()
 
     def test_a_place_that_is_behind_the_nodes_is_not_valid(self, served: tuple[Answers, str]) -> None:
         state, address = served

@@ -132,6 +132,24 @@ class TestPlacing:
         assert late.restarts == 1
         assert late.v_ned_mps is None
 
+    def test_after_a_clock_was_set_back_places_go_on(self) -> None:
+        placing = Placing("b")
+        assert take(placing, *INFOS.values(), oriented(36_000), estimate(36_000)) is not None
+        taken = [take(placing, oriented(k), estimate(k)) for k in range(10)]
+        # One old message is none of a clock that was set back: they come late, too.
+        assert taken[0] is None
+        assert taken[-1] is not None
+        assert taken[-1].restarts == 1
+        # Nor does the end of the track from before keep the poses away.
+        ended = Placing("b")
+        assert take(ended, *INFOS.values(), oriented(36_000), estimate(36_000)) is not None
+        assert [take(ended, attitude("a", at(k)), pose(k)) for k in range(10)][-1] is not None
+
+    def test_a_third_nodes_clock_does_not_count(self) -> None:
+        placed = take(Placing("b"), *INFOS.values(), oriented(), attitude("c", at(300)), estimate())
+        assert placed is not None
+        assert placed.behind_s == 0.0
+
     def test_other_pairs_are_not_taken(self) -> None:
         placing = Placing("b", "c")
         assert take(placing, *INFOS.values(), oriented(), estimate()) is None

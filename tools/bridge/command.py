@@ -176,12 +176,12 @@ class Bridge:
         earth = on_earth(placed, place) if place is not None and placed.is_north_true else None
         self._state.place(placed, earth, place)
         # A tenth of slack: a source at just this rate is not halved by its jitter.
-        due = placed.stamp_ns - self._sent_ns >= 0.9 * self._least_ns
+        due = _is_due(placed.stamp_ns, self._sent_ns, 0.9 * self._least_ns)
         if self._translation is not None and self._to_mavlink is not None and due:
             self._sent_ns = placed.stamp_ns
             for packet in self._translation.packets(placed, earth):
                 self._to_mavlink.send(packet)
-        if self._to_nmea is not None and placed.stamp_ns - self._sent_nmea_ns >= 0.9e9 / NMEA_RATE_HZ:
+        if self._to_nmea is not None and _is_due(placed.stamp_ns, self._sent_nmea_ns, 0.9e9 / NMEA_RATE_HZ):
             self._sent_nmea_ns = placed.stamp_ns
             self._to_nmea.send("".join(sentences(placed, earth)).encode("ascii"))
 
@@ -189,9 +189,11 @@ class Bridge:
         from buddyline.protocol.clock import SystemClock
         from buddyline.tools.bridge.place import BOAT_STALE_NS
 
-        if self._heard_boat_ns is not None and SystemClock().now_ns() - self._heard_boat_ns > BOAT_STALE_NS:
-            return None
-        return self._place
+        if self._heard_boat_ns is None:
+            return self._place
+        # Less than nothing: this machine's clock was set back meanwhile.
+        fresh = 0 <= SystemClock().now_ns() - self._heard_boat_ns <= BOAT_STALE_NS
+        return self._place if fresh else None
 
     def tick(self) -> None:
         """Send what is due each second, and say what is missing, once for each change."""
@@ -235,6 +237,11 @@ class Bridge:
             self._boat.close()
 
 
+def _is_due(stamp_ns: int, sent_ns: int, least_ns: float) -> bool:
+    """Return whether an estimate is to be sent, after one of sent_ns; also where a node's clock was set back."""
+    return not 0 <= stamp_ns - sent_ns < least_ns
+
+
 class Datagrams:
     """Sends datagrams to one address. A receiver that is not there is waited for."""
 
@@ -244,6 +251,8 @@ class Datagrams:
             family, kind, _, _, found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         except OSError as error:
             raise BuddylineError(f"{option} {address}: {error.strerror}") from error
+        except UnicodeError as error:
+            raise BuddylineError(f"{option} {address}: no host can have this name; give HOST:PORT") from error
         self._address: tuple[object, ...] = found
         self._socket = socket.socket(family, kind)
         self._refused = False

@@ -10,6 +10,8 @@ from __future__ import annotations
 import json
 import logging
 import math
+import socket
+import sys
 import threading
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -80,7 +82,8 @@ class Answers:
     def _is_fresh(self) -> bool:
         if self._placed is None or self._placed[0].behind_s > BEHIND_S:
             return False
-        return self._now_ns() - self._placed[1] < stale_after_s(TRACK) * S_NS
+        # Less than nothing: this machine's clock was set back meanwhile.
+        return 0 <= self._now_ns() - self._placed[1] < stale_after_s(TRACK) * S_NS
 
     def _acoustic(self) -> dict[str, object]:
         """Return x north, y east, z the depth (below the reference without a gauge), in metres; std: 1 sd."""
@@ -164,8 +167,14 @@ class _Server(ThreadingHTTPServer):
 
     def __init__(self, address: tuple[str, int], state: Answers) -> None:
         self.state = state
+        self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
         self.is_loopback = address[0] in ("127.0.0.1", "localhost", "::1")
         super().__init__(address, _Handler)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Pass over a client that has gone in mid-answer; anything else is a bug, and keeps its traceback."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)
 
 
 class HttpApi:

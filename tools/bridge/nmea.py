@@ -15,6 +15,8 @@ from buddyline.tools.bridge.placed import Placed
 SATELLITES: Final = 10
 # Error in metres of a receiver with HDOP 1, by the usual rule.
 M_PER_HDOP: Final = 2.5
+# Receivers state 99.99 where they do not know; beyond there is no receiver.
+MOST_HDOP: Final = 100.0
 TARGET: Final = 1
 
 
@@ -101,6 +103,8 @@ def place_of(line: str) -> GeoPoint | None:
     try:
         if kind == "GGA" and fields[6] not in ("", "0"):
             hdop = float(fields[8] or "nan")
+            if not (math.isnan(hdop) or 0.0 <= hdop <= MOST_HDOP):
+                return None
             sigma_m = M_PER_HDOP * hdop / math.sqrt(2.0) if math.isfinite(hdop) else 0.0
             return GeoPoint(_degrees_of(fields[2], fields[3]), _degrees_of(fields[4], fields[5]), sigma_m)
         if kind == "RMC" and fields[2] == "A":

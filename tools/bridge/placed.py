@@ -17,7 +17,7 @@ from buddyline.protocol.health import stale_after_s
 from buddyline.protocol.messages import Attitude, Depth, NodeInfo, NodePose, RelativePose, Track
 from buddyline.protocol.topics import TRACK
 from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, skew
-from buddyline.solver_service.sensors import SampleStream, attitude_at
+from buddyline.solver_service.sensors import HORIZON_NS, BackwardJump, SampleStream, attitude_at
 from buddyline.solver_service.track.anchors import attitude_covariance
 from buddyline.tools.estimate import Estimate
 
@@ -115,6 +115,7 @@ class Placing:
         self._depth_m: float | None = None
         self._tracked_ns: int | None = None
         self._last_ns: int | None = None
+        self._jump = BackwardJump()
         self._restarts = 0
 
     def take(self, envelope: Envelope) -> Placed | None:
@@ -148,7 +149,10 @@ class Placing:
                 return False
             self._tracked_ns = estimate.stamp_ns
             return True
-        return self._tracked_ns is None or estimate.stamp_ns - self._tracked_ns > stale_after_s(TRACK) * S_NS
+        if self._tracked_ns is None:
+            return True
+        # Much older: the clock was set back after the track had ended.
+        return not -HORIZON_NS <= estimate.stamp_ns - self._tracked_ns <= stale_after_s(TRACK) * S_NS
 
     def _in_pair(self, estimate: Estimate) -> Placed | None:
         """Return T_ned_body of the vehicle from T_a_b and A's attitude.
@@ -226,9 +230,12 @@ class Placing:
     def _finished(self, placed: Placed) -> Placed | None:
         """Return a place by true north if that is known, with depth, restarts and age; None if it cannot be used."""
         stamp_ns = placed.stamp_ns
-        if self._last_ns is not None and stamp_ns <= self._last_ns:
-            return None
-        if self._last_ns is not None and stamp_ns - self._last_ns > stale_after_s(TRACK) * S_NS:
+        verdict = self._jump.judge(stamp_ns, self._last_ns)
+        if self._last_ns is not None and verdict != "restart":
+            if verdict == "drop" or stamp_ns <= self._last_ns:
+                return None
+            self._restarts += stamp_ns - self._last_ns > stale_after_s(TRACK) * S_NS
+        elif verdict == "restart":
             self._restarts += 1
         self._last_ns = stamp_ns
         if not placed.is_north_true and self._declination_rad is not None:
@@ -237,9 +244,9 @@ class Placing:
             self.why = "the estimate is out of numeric range"
             return None
         self.why = ""
-        newest_ns = max(
-            (stream.newest_ns for stream in self._attitudes.values() if stream.newest_ns is not None), default=stamp_ns
-        )
+        # A third node's clock may be any.
+        streams = [self._attitudes[node] for node in (placed.vehicle, placed.reference) if node in self._attitudes]
+        newest_ns = max((stream.newest_ns for stream in streams if stream.newest_ns is not None), default=stamp_ns)
         depth_m, info = self._depth_m, self._infos[self.vehicle]
         if depth_m is not None:
             # The gauge's port is not the camera.
