@@ -10,7 +10,8 @@ from buddyline.protocol.errors import BuddylineError
 
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 
-_ENDPOINT = re.compile(r"(?:tcp|tls)/(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9_.-]+):([0-9]{1,5})\Z")
+_LABEL = "[A-Za-z0-9_-]{1,63}"
+_ENDPOINT = re.compile(rf"(?:tcp|tls)/(\[[0-9a-fA-F:.]+\]|{_LABEL}(?:\.{_LABEL})*\.?):([0-9]{{1,5}})\Z")
 
 
 def host_and_port(endpoint: str) -> tuple[str, int]:

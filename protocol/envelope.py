@@ -20,6 +20,8 @@ from buddyline.protocol.topics import Topic, key_of, parse_key
 log = logging.getLogger(__name__)
 
 MAX_NAMED_KEYS: Final = 32
+# Characters of a key, or of a reason, that are logged.
+MAX_SHOWN: Final = 400
 CAMERA_FRAME: Final = "_camera"
 
 
@@ -143,14 +145,21 @@ class Refusals:
             refused.count += 1
             count = refused.count
         if self._who and count.bit_count() == 1:
-            log.warning("%s: bad message on %s: %s (%d so far)", self._who, key, error, count)
+            log.warning("%s: bad message on %s: %s (%d so far)", self._who, _shown(key), _shown(str(error)), count)
 
     def lines(self) -> list[str]:
         """Return a line for each key: the number of refused messages, and the reason of the first."""
         with self._lock:
             return [
-                f"{key}: {refused.count} refused, the first: {refused.first}" for key, refused in self.by_key.items()
+                f"{_shown(key)}: {refused.count} refused, the first: {_shown(refused.first)}"
+                for key, refused in self.by_key.items()
             ]
+
+
+def _shown(text: str) -> str:
+    """Return a stranger's text as a terminal may show it: no control characters, and of a long one the begin."""
+    short = text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."
+    return "".join(letter if letter.isprintable() else "?" for letter in short)
 
 
 def read_message(path: Path, schema: type[M]) -> M:

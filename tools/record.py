@@ -19,6 +19,7 @@ from buddyline.tools.authenticity import digest_check, report
 from buddyline.tools.client import client_config
 from buddyline.tools.filling import Filler
 from buddyline.tools.live import LiveClient, follow
+from buddyline.tools.newfile import check_new
 from buddyline.tools.progress import terminal_size
 
 if TYPE_CHECKING:
@@ -63,7 +64,8 @@ def run(args: argparse.Namespace) -> int:
     """Record until stopped."""
     config = client_config(args)
     client = LiveClient("record", config, args.seconds)
-    recorder = Recorder(args.output, metadata={"command": "record"})
+    new = check_new(args.output, "a log is never overwritten, name another or remove it first")
+    recorder = Recorder(new, metadata={"command": "record"})
     recording = Recording(recorder, None if config.tls is None else config.tls.ca)
 
     def record(bus: Bus) -> None:

@@ -122,6 +122,8 @@ def run(args: argparse.Namespace) -> int:
             follow_running(bus, states, streams, client.refusals, publish)
             client.wait()
         finally:
+            # First, because messages come until then.
+            bus.close()
             session.close()
 
     return client.run(translate)

@@ -81,3 +81,13 @@ def test_refusals_of_many_keys_take_bounded_memory(caplog):
     assert refusals.count == 1000
     assert len(refusals.lines()) == MAX_NAMED_KEYS + 1
     assert not caplog.records
+
+
+def test_a_strangers_text_is_logged_short_and_without_control_characters(caplog):
+    refusals = Refusals("test")
+    key = "elsewhere/\x1b]0;title\x07/" + "q" * 5000
+    assert refusals.open(Received(key, b"{}", 0, "")) is None
+    for said in (caplog.text, *refusals.lines()):
+        assert "elsewhere/?]0;title?/qqq" in said
+        assert len(said) < 1100
+        assert "\x1b" not in said

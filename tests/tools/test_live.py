@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.cli import main
 from buddyline.tools.client import ClientConfig
 from buddyline.tools.live import LiveClient, NoHubError, open_bus_within
 from buddyline.tools.measure.children import Child, end_all
@@ -40,6 +41,13 @@ def test_a_command_without_a_hub_ends_when_its_time_is_over(tmp_path, words):
     if words[0] == "record":
         assert "out.mcap: 0 messages, 0 dropped, 0 bad; nothing came, so no log is left" in done.stderr
         assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("endpoint", ["a..b:7447", "tcp/a..b:7447", f"tcp/{'x' * 64}:7447", "tcp/127.0.0.1"])
+def test_an_address_that_no_hub_can_have_is_an_error(tmp_path, capsys, endpoint):
+    assert main(["record", str(tmp_path / "out.mcap"), "--connect", endpoint, "--seconds", "1"]) == 2
+    assert f"endpoint '{endpoint}': write it as tcp/<host>:<port>" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_ctrl_c_ends_the_wait_for_a_hub(tmp_path):

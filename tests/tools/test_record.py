@@ -20,6 +20,7 @@ import pytest
 from buddyline.protocol.divelog import DiveLogReader
 from buddyline.protocol.topics import DEPTH
 from buddyline.protocol.zenoh_bus import connect, open_hub
+from buddyline.tools.cli import main
 from buddyline.tools.record import progress_words
 
 from tests.disks import small_disk
@@ -150,3 +151,8 @@ def test_a_log_that_is_deleted_meanwhile_ends_the_recording(tmp_path: Path) -> N
         put_until(published, record, "out.mcap: was removed while it was written")
         assert record.wait() == 2
         assert sum("was removed" in line for line in record.lines) == 1
+
+
+def test_it_does_not_record_into_standard_output(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["record", "-"]) == 2
+    assert "-: this does not go to standard output; name a file" in capsys.readouterr().err

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import struct
 import threading
@@ -13,12 +14,13 @@ import pytest
 from buddyline.protocol.clock import S_NS, ManualClock
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message, NodePose
+from buddyline.protocol.topics import DEPTH
 from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from buddyline.tools.export.ros_messages import MAP, RANGE_TYPE, RosMessage, Translation, name_of, type_store
 from buddyline.tools.ros2 import RosGraph, attachment, dds_type
 from msgspec.structs import replace
 
-from tests.processes import PATIENCE_S, free_endpoint
+from tests.processes import PATIENCE_S, Process, free_endpoint
 from tests.tools.evaluated import INFOS, pose, track
 from tests.tools.watched import at, attitude, depth
 
@@ -307,6 +309,32 @@ def test_over_the_bus_keys_tokens_and_sequence_are_those_of_rmw_zenoh(store: Any
         f"@ros2_lv/3/{zid}/0/0/NN/%/%/buddyline",
         f"@ros2_lv/3/{zid}/0/1/MP/%/%/buddyline/%buddyline%a%depth/{kind}/{hashed}/::,10:,:,:,,",
     ]
+
+
+def test_messages_that_come_while_it_ends_are_no_fault(store: Any) -> None:
+    from buddyline.protocol.zenoh_bus import connect, open_hub
+
+    endpoint, stop = free_endpoint(), threading.Event()
+    with open_hub(endpoint), Process("ros2", "--connect", endpoint) as ros2:
+        bus = connect(endpoint, stop=stop, on_wait=lambda _: None)
+        assert bus is not None
+        publisher = bus.publisher(DEPTH, "a")
+
+        def send() -> None:
+            for k in itertools.count():
+                if stop.wait(0.002):
+                    return
+                publisher.put(depth("a", at(k), 12.5))
+
+        sender = threading.Thread(target=send)
+        sender.start()
+        try:
+            ros2.wait_for("/buddyline/a/depth")
+            assert ros2.end() == 0, ros2.lines
+        finally:
+            stop.set()
+            sender.join()
+            bus.close()
 
 
 def test_a_secured_hub_lets_the_bridge_publish_for_ros_and_nobody_else(store: Any, tmp_path: Path) -> None:
