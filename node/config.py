@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import numpy as np
 from buddyline.node.geomagnetism import EarthField, MagnetometerCalibration, earth_field
 from buddyline.protocol.blinking import DARK_SLOTS
-from buddyline.protocol.config import Config, ConfigError, load_config
+from buddyline.protocol.config import Config, ConfigError, Namespace, load_config
 from buddyline.protocol.messages import (
     ArTag,
     Blink,
@@ -303,10 +303,10 @@ class NodeConfig(Config, frozen=True, kw_only=True):
     fixed: FixedConfig | None = None
     blink: BlinkConfig | None = None
     connect: str = "tcp/127.0.0.1:7447"
-    namespace: str = ""
+    namespace: Namespace = ""
     tls: Tls | None = None
     status_file: str = ""
-    rate_hz: Annotated[float, Meta(gt=0, le=200)] = 10.0
+    rate_hz: Annotated[float, Meta(ge=1e-6, le=200)] = 10.0
     camera: CameraConfig = field(default_factory=CameraConfig)
     exposure: ExposureConfig = field(default_factory=ExposureConfig)
     detector: DetectorConfig = field(default_factory=DetectorConfig)

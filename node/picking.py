@@ -7,7 +7,8 @@ class RateLimiter:
     """Allows frames at rate_hz or less, also where the clock jumps; allows none where rate_hz is 0."""
 
     def __init__(self, rate_hz: float) -> None:
-        self._period_ns = round(0.99e9 / rate_hz) if rate_hz > 0 else 0
+        # From one frame in thirty years to every frame.
+        self._period_ns = max(round(0.99e9 / max(rate_hz, 1e-9)), 1) if rate_hz > 0 else 0
         self._next_ns = 0
 
     def allow(self, stamp_ns: int) -> bool:

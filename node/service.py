@@ -167,8 +167,9 @@ class NodeService(Service):
         directory = Path(self.config.record.directory)
         try:
             directory.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ConfigError(f"record.directory = {directory}: cannot be made: {error.strerror}") from error
+        except (OSError, ValueError) as error:
+            why = error.strerror if isinstance(error, OSError) else error
+            raise ConfigError(f"record.directory = {str(directory)!r}: cannot be made: {why}; name another") from error
         begun = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(self.clock.now_ns() / S_NS))
         return directory / f"{self.config.node}-{begun}-{self.boot}.mcap"
 

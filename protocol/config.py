@@ -9,7 +9,7 @@ import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Annotated, Any, Final, TypeAlias, TypeVar
 
 import msgspec
 from buddyline.protocol.errors import BuddylineError
@@ -20,6 +20,10 @@ C = TypeVar("C", bound=msgspec.Struct)
 LONG: Final = 100_000
 # What a dive log begins with.
 MCAP: Final = b"\x89MCAP"
+
+
+# In front of all keys on the bus; Zenoh gives other characters a meaning of their own.
+Namespace: TypeAlias = Annotated[str, msgspec.Meta(pattern=r"^([A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*)?\Z")]
 
 
 class ConfigError(BuddylineError):

@@ -7,7 +7,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Annotated, cast
 
-from buddyline.protocol.config import Config, ConfigError, load_config
+from buddyline.protocol.config import Config, ConfigError, Namespace, load_config
 from buddyline.protocol.envelope import read_message
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import NodeId, NodeInfo, TrackMode
@@ -84,7 +84,7 @@ class SolverConfig(Config, frozen=True, kw_only=True):
     nodes: list[NodeId] = field(default_factory=list)
     pairs: list[tuple[NodeId, NodeId]] = field(default_factory=list)
     connect: str = "tcp/127.0.0.1:7447"
-    namespace: str = ""
+    namespace: Namespace = ""
     tls: Tls | None = None
     status_file: str = ""
     journal: str = ""

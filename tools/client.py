@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from buddyline.protocol.config import Config, load_config
+from buddyline.protocol.config import Config, Namespace, load_config
 from buddyline.protocol.endpoint import DEFAULT_ENDPOINT
 from buddyline.protocol.security import VIEWER, Tls, check_identity
 from msgspec.structs import replace
@@ -15,7 +15,7 @@ class ClientConfig(Config, frozen=True, kw_only=True):
     """The TOML file of a command on the bus (`buddyline keys viewer`, `surveyor`, `player` and `ros2` write one)."""
 
     connect: str = DEFAULT_ENDPOINT
-    namespace: str = ""
+    namespace: Namespace = ""
     tls: Tls | None = None
 
 

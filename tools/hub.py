@@ -7,7 +7,7 @@ import logging
 import os
 from typing import TYPE_CHECKING, Final
 
-from buddyline.protocol.config import Config, load_config
+from buddyline.protocol.config import Config, Namespace, load_config
 from buddyline.protocol.endpoint import DEFAULT_ENDPOINT, is_loopback
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NodeId
@@ -35,7 +35,7 @@ class HubConfig(Config, frozen=True, kw_only=True):
     """
 
     listen: str = DEFAULT_ENDPOINT
-    namespace: str = ""
+    namespace: Namespace = ""
     nodes: list[NodeId] = field(default_factory=list)
     shut_out: list[str] = field(default_factory=list)
     tls: Tls | None = None

@@ -32,6 +32,7 @@ from buddyline.node.service import NodeService
 from buddyline.node.time_base import NodeClock
 from buddyline.protocol.clock import MS_NS, S_NS
 from buddyline.protocol.codec import decode
+from buddyline.protocol.config import ConfigError
 from buddyline.protocol.divelog import DiveLogReader
 from buddyline.protocol.messages import Depth, Imu, NodeStatus
 from buddyline.tools.dives import Dive
@@ -200,6 +201,17 @@ def test_a_read_only_disk_is_refused_at_the_start_in_one_line(tmp_path):
         assert not [line for line in process.lines if "Traceback" in line]
 
 
+@pytest.mark.parametrize("directory", ["/dev/null", "a\0b"])
+def test_a_folder_that_cannot_be_made_is_refused_with_its_name(directory):
+    config = NodeConfig(
+        node="a", sensors=SensorsConfig(name="simulated"), record=RecordConfig(directory=directory, images_hz=0.0)
+    )
+    service = NodeService(config)
+    with pytest.raises(ConfigError) as refused:
+        service.open()
+    assert str(refused.value).startswith(f"record.directory = {directory!r}: cannot be made: ")
+
+
 class Settable:
     """The machine's clock, as if it had been set."""
 
@@ -251,6 +263,12 @@ def test_pictures_keep_their_rate_when_the_clock_is_set(step_ns):
     taken = [i for i in range(40) if turn.allow(i * 100 * MS_NS + 7200 * S_NS + (step_ns if i >= 20 else 0))]
     assert all(4 <= later - earlier <= 6 or earlier < 20 <= later for earlier, later in pairwise(taken))
     assert len(taken) in (8, 9)
+
+
+@pytest.mark.parametrize(("rate_hz", "count"), [(0.0, 0), (1e-300, 1), (1e12, 40)])
+def test_a_rate_of_pictures_may_be_any_number(rate_hz, count):
+    turn = RateLimiter(rate_hz)
+    assert sum(turn.allow(7200 * S_NS + i * 100 * MS_NS) for i in range(40)) == count
 
 
 class PictureOutlet:

@@ -5,6 +5,9 @@ from datetime import datetime
 import pytest
 from buddyline.node.config import NodeConfig
 from buddyline.protocol.config import LONG, Config, ConfigError, config_sha256, load_config, parse_config
+from buddyline.solver_service.config import SolverConfig
+from buddyline.tools.client import ClientConfig
+from buddyline.tools.hub import HubConfig
 
 
 @pytest.mark.parametrize(
@@ -15,6 +18,10 @@ from buddyline.protocol.config import LONG, Config, ConfigError, config_sha256, 
         ('node = "a/b"\n', ["node", "'a/b'"]),
         ('node = "a"\nrate_hz = "ten"\n', ["rate_hz", "'ten'"]),
         ('node = "a"\nrate_hz = -1.0\n', ["rate_hz", "-1.0"]),
+        ('node = "a"\nrate_hz = 1e-300\n', ["rate_hz", "1e-300"]),
+        ('node = "a"\nnamespace = "a//b"\n', ["namespace", "'a//b'"]),
+        ('node = "a"\nnamespace = "a/*"\n', ["namespace", "'a/*'"]),
+        ('node = "a"\nnamespace = "/a"\n', ["namespace", "'/a'"]),
         ("rate_hz = 1.0\n", ["node"]),
         ('node = "a\n', ["not TOML"]),
     ],
@@ -72,6 +79,13 @@ def test_a_file_that_is_no_text_is_named_with_what_is_wanted(tmp_path, content, 
 def test_lines_may_end_as_on_windows(tmp_path):
     (tmp_path / "a.toml").write_bytes(b'\xef\xbb\xbfnode = "a"\r\nrate_hz = 5.0\r\n')
     assert load_config(tmp_path / "a.toml", NodeConfig).rate_hz == 5.0
+
+
+@pytest.mark.parametrize("schema", [ClientConfig, HubConfig, SolverConfig])
+def test_a_namespace_that_is_no_part_of_a_key_is_refused(schema):
+    assert parse_config('namespace = "pool/lane-2"', schema, "a.toml").namespace == "pool/lane-2"
+    with pytest.raises(ConfigError, match="namespace = 'a/'"):
+        parse_config('namespace = "a/"', schema, "a.toml")
 
 
 def test_defaults_apply_and_change_the_hash_when_overridden():
