@@ -14,7 +14,7 @@ from buddyline.node.drivers.lsm6ds import Lsm6ds, Lsm6ds33, Lsm6dso
 from buddyline.node.drivers.lsm303d import ACCEL_MPS2_PER_COUNT, Lsm303d, decode_accel
 from buddyline.node.drivers.samples import DeviceError, ImuReading, ImuSample, SettlingError, Vector
 from buddyline.node.drivers.st_chip import WHO_AM_I, StChip
-from buddyline.node.drivers.watch import FULL_SCALE_COUNTS, SensorWatch, SettingsWatch
+from buddyline.node.drivers.watch import FROZEN_READINGS, FULL_SCALE_COUNTS, SensorWatch, SettingsWatch
 from buddyline.protocol.clock import MS_NS, S_NS, Clock
 from buddyline.protocol.errors import BuddylineError
 from numpy.typing import NDArray
@@ -153,8 +153,8 @@ class ImuBoard:
     R_body_chip: (3, 3), maps the board's axes to the body's (x forward, y right, z down). After any failure
     the chips are identified and set up again before the next reading counts, because a chip sleeps after a
     brown-out. Control registers are read back once a second, and at once where a sensor reads zero. The magnetometer is
-    read for the last sample of a reading. One that fails, or is absent at the start, is named in `problem` and tried
-    again once a second; samples continue.
+    read for the last sample of a reading. One that fails, stands still, or is absent at the start, is named in
+    `problem` and tried again once a second; samples continue.
     """
 
     def __init__(
@@ -179,6 +179,7 @@ class ImuBoard:
         self._motion_ready = False
         self._mag_ready = False
         self._mag_retry_ns = 0
+        self._last_mag, self._mag_repeats = b"", 0
 
     @property
     def problem(self) -> str:
@@ -291,6 +292,12 @@ class ImuBoard:
             data = self._magnetometer.read_mag()
             if not any(data):
                 raise DeviceError(f"{self.name}: the magnetometer reads zero on all axes")
+            self._mag_repeats = self._mag_repeats + 1 if data == self._last_mag else 0
+            self._last_mag = data
+            if self._mag_repeats >= FROZEN_READINGS:
+                raise DeviceError(
+                    f"{self.name}: the magnetometer gives the same reading again and again: it has stopped"
+                )
         except DeviceError as error:
             self._lose_mag(now_ns, error)
             return None

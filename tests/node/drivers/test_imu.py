@@ -323,6 +323,23 @@ def test_a_frozen_chip_is_noticed_and_set_up_again(unit, adapter, bus, clock, sk
         read(device, clock)
 
 
+@pytest.mark.parametrize("name", ["minimu9_v3", "minimu9_v5", "minimu9_v6"])
+def test_a_frozen_magnetometer_is_named_and_gives_no_field_until_it_goes_on(name, adapter, bus, clock, sky):
+    plug(adapter, name, sky)
+    device = open_imu(bus, name, clock=clock)
+    sky.frozen.add("mag")
+    fields = [read(device, clock).mag_t for _ in range(3 * FROZEN_READINGS)]
+    assert sum(field is not None for field in fields) == FROZEN_READINGS
+    assert "the magnetometer gives the same reading again and again: it has stopped" in device.problem
+    # Nor where it was started again, and still stands.
+    clock.set_ns(clock.now_ns() + 2 * S_NS)
+    assert read(device, clock).mag_t is None
+    sky.frozen.clear()
+    clock.set_ns(clock.now_ns() + 2 * S_NS)
+    assert read(device, clock).mag_t is not None
+    assert device.problem == ""
+
+
 @pytest.mark.parametrize("name", ["minimu9_v5", "minimu9_v6"])
 def test_without_its_magnetometer_the_rest_goes_on(name, adapter, bus, clock, sky):
     chips = plug(adapter, name, sky)

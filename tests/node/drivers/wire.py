@@ -107,7 +107,7 @@ class Sky:
     """What the chips feel: counts that a test sets; a little noise in the last bits, as real chips have.
 
     accel: counts at +-2 g. A chip set to another range reads fewer, and clips as a real one does. silent: sensors
-    that give zeros.
+    that give zeros. frozen: that give the same again and again.
     """
 
     def __init__(self) -> None:
@@ -116,11 +116,12 @@ class Sky:
         self.mag = (1250, 0, 2700)
         self.noisy = True
         self.silent: set[str] = set()
+        self.frozen: set[str] = set()
         self._rng = np.random.default_rng(1)
 
     def counts(self, what: str, scale: Callable[[], int] = lambda: 1) -> Callable[[], tuple[int, int, int]]:
         def read() -> tuple[int, int, int]:
-            noise = self._rng.integers(-2, 3, 3) if self.noisy else np.zeros(3, dtype=int)
+            noise = self._rng.integers(-2, 3, 3) if self.noisy and what not in self.frozen else np.zeros(3, dtype=int)
             if what in self.silent:
                 return 0, 0, 0
             felt = np.array(getattr(self, what)) // scale() + noise
