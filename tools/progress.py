@@ -70,9 +70,9 @@ class Progress:
         share = min(max(done / self.total, 0.0), 1.0)
         left_s = (now_s - self._began_s) * (1 - share) / share if share > 0 else 0.0
         bar = "#" * round(share * WIDTH)
-        print(
-            f"\r{self.what} [{bar:<{WIDTH}}] {share:4.0%} {left_s:4.0f} s left {note}\x1b[K", end="", file=self._stream
-        )
+        line = f"{self.what} [{bar:<{WIDTH}}] {share:4.0%} {left_s:4.0f} s left {note}"
+        # A longer one would go on in the next line, and stay there.
+        print(f"\r{line[: max(terminal_size().columns - 1, 0)]}\x1b[K", end="", file=self._stream)
         self._stream.flush()
         self._shown_s, self._shown = now_s, True
 

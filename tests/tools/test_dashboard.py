@@ -111,6 +111,15 @@ def test_the_screen_fits_its_terminal(size):
     assert ("latency" in text) == (size[1] > 24)
 
 
+@pytest.mark.parametrize("size", [(1, 1), (2, 1), (3, 2), (10, 3), (1, 60), (300, 1)])
+def test_a_tiny_terminal_gets_what_fits(size):
+    watch = running()
+    text = watch.dashboard.screen(*size)
+    lines = text.removeprefix("\x1b[H").removesuffix("\x1b[K\x1b[J").split("\x1b[K\n")
+    assert len(lines) <= max(size[1], 1)
+    assert all(len(line) < size[0] for line in lines)
+
+
 def test_a_terminal_that_nobody_gave_a_size_counts_as_80_by_24(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("COLUMNS", raising=False)
     monkeypatch.delenv("LINES", raising=False)

@@ -37,6 +37,14 @@ def test_items_and_records_are_followed(terminal, tmp_path):
     assert "follow [" in terminal.getvalue()
 
 
+def test_the_line_fits_a_narrow_terminal(terminal, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "20")
+    with redirect_stderr(terminal):
+        assert list(progress.counted("abc", "count what there is")) == ["a", "b", "c"]
+    lines = [line.removesuffix("\x1b[K") for line in terminal.getvalue().split("\r")]
+    assert max(map(len, lines)) == 19
+
+
 @pytest.mark.parametrize(
     "words",
     [

@@ -65,6 +65,16 @@ def test_the_screen_fits_the_terminal_and_counts_pairs():
     assert "a/b" in screen
 
 
+@pytest.mark.parametrize("size", [(1, 1), (2, 1), (3, 2), (10, 3), (1, 60), (300, 1)])
+def test_a_tiny_terminal_gets_what_fits(size):
+    watch = WatchedTeam()
+    watch.tell("a", 0)
+    watch.take(pose(1))
+    screen = re.sub(r"\x1b\[[0-9;]*[A-Z]", "", watch.dashboard.screen(*size))
+    assert len(screen.split("\n")) <= size[1]
+    assert max(map(len, screen.split("\n"))) <= size[0]
+
+
 def test_the_summary_has_each_nodes_errors():
     watch = WatchedTeam()
     for k in range(0, 20, 2):

@@ -150,12 +150,12 @@ class Dashboard:
             )
 
     def screen(self, width: int, height: int, *, coloured: bool = False, arrows: str = ARROWS) -> str:
-        """Return the present state as a screen of text that overwrites the last one, from 60 x 14 characters on."""
+        """Return the present state as a screen of text that overwrites the last one; whole from 60 x 14 characters."""
         with self._lock:
             shown = self._shown()
             told = self._pose_lines(shown)
             for text in (self._shares(), self._reason_line()):
-                told += wrap(text, width - 1)
+                told += wrap(text, max(width - 1, 1))
             room = height - len(told) - 2
             more = ["", *self._health_lines(), ""] if room >= MORE_ROWS else []
             room -= len(more)
@@ -164,7 +164,8 @@ class Dashboard:
             troubled = coloured and shown is not None and self._age(shown)
         if troubled:
             lines[0] = f"{YELLOW}{lines[0]}{PLAIN}"
-        return overwritten([self._title[: width - 1], *above, *lines])
+        # A terminal with more lines than it has room for would move all of them up.
+        return overwritten([self._title[: width - 1], *above, *lines][: max(height, 1)])
 
     def _count_in_view(self, outcome: RelativePose | Rejected) -> bool:
         """Count a trigger's lights; return whether all four were in view, each by itself."""

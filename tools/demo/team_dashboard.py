@@ -136,7 +136,7 @@ class TeamDashboard:
             said = sorted({problem for problem in self._problems.values() if problem}) or ["solver ok"]
             text = [*text_table(rows).split("\n"), ""]
             for words in (_pair_words(self._pair_figures()), _reasons_words(self._reasons), *said):
-                text += wrap(words, width - 1)
+                text += wrap(words, max(width - 1, 1))
             text.append("Ctrl-C ends.")
             room = min(height - len(text) - 3, MAP_ROWS)
             above = self._from_above(min(width - 1, MAP_COLUMNS), room, arrows)
