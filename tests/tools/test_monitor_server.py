@@ -121,6 +121,15 @@ class TestWhoMayLook:
         with serving(filled(1)) as (page, _), pytest.raises(urllib.error.HTTPError, match="403"):
             fetch(page, "/", Host=host)
 
+    @pytest.mark.parametrize(("path", "host"), [("/", "[::1"), ("//[::1", "localhost")])
+    def test_what_is_no_address_is_refused_as_such(self, path: str, host: str) -> None:
+        with serving(filled(1)) as (page, _), pytest.raises(urllib.error.HTTPError, match="400"):
+            fetch(page, path, Host=host)
+
+    def test_an_origin_that_is_no_address_gets_no_socket(self) -> None:
+        with serving(filled(1)) as (page, _), pytest.raises(InvalidStatus, match="400"):
+            joined(page, origin="http://[")
+
     @pytest.mark.parametrize("host", ["localhost", "127.0.0.1:9", "[::1]:80"])
     def test_this_machine_s_own_names_are_not(self, host: str) -> None:
         with serving(filled(1)) as (page, _):

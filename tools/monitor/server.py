@@ -173,16 +173,19 @@ class _Serving:
 
     async def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
         """Answer a request for a file, refuse one that may not be, or let a WebSocket through (None)."""
-        path, query = urlsplit(request.path).path, urlsplit(request.path).query
-        host = request.headers.get("Host", "")
-        name = urlsplit(f"//{host}").hostname or ""
+        host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
+        try:
+            path, query = urlsplit(request.path).path, urlsplit(request.path).query
+            name = urlsplit(f"//{host}").hostname or ""
+            asking = host if origin is None else urlsplit(origin).netloc
+        except ValueError:
+            return self._refuse(connection, HTTPStatus.BAD_REQUEST, "This is no address.")
         # With a token, the page may have any name: whoever has the link was given it.
         if not self._server.token and not is_local(name):
             return self._refuse(connection, HTTPStatus.FORBIDDEN, f"This page is not at {name}.")
         if path != "/ws":
             return self._file(connection, request, path)
-        origin = request.headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc != host:
+        if asking != host:
             return self._refuse(connection, HTTPStatus.FORBIDDEN, "A page of another site may not read this.")
         given = parse_qs(query).get("token", [""])[0]
         if self._server.token and not hmac.compare_digest(given.encode(), self._server.token.encode()):
