@@ -70,7 +70,12 @@ def run(args: argparse.Namespace) -> int:
         where = folder if len(dives) == 1 else folder / f"dive-{number}"
         where.mkdir(exist_ok=True)
         log.info("dive %d of %d: %s", number, len(dives), one.words)
-        status |= _solve(one, where)
+        try:
+            status |= _solve(one, where)
+        except BuddylineError as error:
+            # The other dives are solved all the same.
+            log.error("%s: not solved: %s", where, error)
+            status |= 1
     return status
 
 
@@ -123,8 +128,14 @@ def _solve(outing: Outing, folder: Path) -> int:
     status = run_command(words)
     if not solved.exists():
         return 1
-    for kind, name in (("tum", "track.tum"), ("csv", "track.csv")):
-        status |= run_command(["export", str(solved), "--format", kind, "-o", str(folder / name)])
+    with Dive([solved]) as dive:
+        has_rows = bool(dive.ids("pose", "track"))
+    if has_rows:
+        for kind, name in (("tum", "track.tum"), ("csv", "track.csv")):
+            status |= run_command(["export", str(solved), "--format", kind, "-o", str(folder / name)])
+    else:
+        log.error("%s: no pose: the report says why", solved)
+        status |= 1
     try:
         status |= run_command(["report", str(solved), "-o", str(folder / "report.html")])
     except MissingExtraError as error:

@@ -19,6 +19,8 @@ from buddyline.tools.cli import main
 from buddyline.tools.dives import Dive
 from buddyline.tools.extras import MissingExtraError
 
+from tests.tools.evaluated import pose, write_log
+
 LOGS = Path(__file__).parents[1] / "data" / "golden"
 
 
@@ -139,8 +141,45 @@ def test_a_folder_that_an_interrupted_call_left_empty_is_taken_and_one_that_cann
     assert "cannot be made: Not a directory" in capsys.readouterr().err
 
 
+def part(source, target, begin_s, end_s):
+    """A part of a log."""
+    with DiveLogReader(source) as reader, DiveLogWriter(target) as writer:
+        for record in reader.records():
+            if record.key.endswith("/info") or begin_s <= (record.log_time_ns - reader.start_ns) / S_NS < end_s:
+                writer.write(record.key, record.payload, record.log_time_ns)
+
+
+def test_a_dive_without_a_pose_has_a_report_that_says_why(folders, capsys):
+    pytest.importorskip("matplotlib")
+    for node, begin_s in (("a", 0), ("b", 3)):
+        (folders / f"part_{node}").mkdir()
+        part(folders / node / f"{node}-1.mcap", folders / f"part_{node}" / "1.mcap", begin_s, begin_s + 2)
+    out = folders / "dive"
+    assert main(["after", str(folders / "part_a"), str(folders / "part_b"), "-o", str(out)]) == 1
+    said = capsys.readouterr()
+    assert f"{out}: report.html, solved.mcap" in said.out
+    assert "solve it first" not in said.err
+
+
+def test_a_dive_that_cannot_be_solved_costs_no_other(folders, monkeypatch, caplog):
+    for node in "ab":
+        moved(folders / node / f"{node}-1.mcap", folders / node / f"{node}-2.mcap", hours=5)
+    asked = []
+
+    def solve(one, folder):
+        asked.append(folder.name)
+        if len(asked) == 1:
+            raise BuddylineError("lights of nobody")
+        return 0
+
+    monkeypatch.setattr(after, "_solve", solve)
+    assert main(["after", str(folders / "a"), str(folders / "b"), "-o", str(folders / "dive")]) == 1
+    assert asked == ["dive-1", "dive-2"]
+    assert f"{folders / 'dive' / 'dive-1'}: not solved: lights of nobody" in caplog.text
+
+
 def test_a_report_that_cannot_be_written_is_a_failure_and_one_without_its_extra_is_not(tmp_path, monkeypatch):
-    (tmp_path / "solved.mcap").write_bytes(b"x")
+    write_log(tmp_path / "solved.mcap", pose(0))
     one = after.Outing(0, 1, [tmp_path / "a.mcap"], {"a"})
     faults = {"full": BuddylineError("No space left on device"), "bare": MissingExtraError("needs matplotlib")}
 

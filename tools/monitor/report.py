@@ -65,7 +65,8 @@ def run(args: argparse.Namespace) -> int:
         checked = check_logs(dive.readers, args.authority)
         text = report_html(dive, solved_pair(dive, args.pair), checked, about)
         if not dive.ids("pose", "net_pose", "track"):
-            log.warning("%s: no poses in it, so that the report has none; solve it first: buddyline solve", dive.name)
+            first = "" if dive.ids("rejected") else "; solve it first: buddyline solve"
+            log.warning("%s: no poses in it, so that the report has none%s", dive.name, first)
     write_new(args.output, text)
     log.info("%s: %.1f MB", args.output, len(text) / 1e6)
     return 0
