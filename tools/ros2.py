@@ -30,6 +30,8 @@ log = logging.getLogger(__name__)
 NODE_NAME: Final = "buddyline"
 # Quality of service in rmw_zenoh's liveliness tokens: reliable, volatile, the last 10 kept, the rest default.
 QOS: Final = "::,10:,:,:,,"
+# A client that invents nodes must not fill hub and graph; 16 nodes have some 700.
+MAX_TOPICS: Final = 2048
 
 
 class RosGraph:
@@ -60,6 +62,8 @@ class RosGraph:
         """Declare the topic of a message, if it is not declared yet."""
         if message.topic in self._endpoints:
             return
+        if len(self._endpoints) >= MAX_TOPICS:
+            raise MessageError(f"{message.topic}: there are {MAX_TOPICS} topics of ROS already")
         entity = len(self._endpoints) + 1
         type_key = f"{dds_type(message.type_name)}/{self._store.hash_rihs01(message.type_name)}"
         mangled = message.topic.replace("/", "%")

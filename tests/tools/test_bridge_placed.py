@@ -14,7 +14,7 @@ from buddyline.solver_service.geometry.rotation import (
     rotation_log,
 )
 from buddyline.tools.bridge.place import GeoPoint, on_earth
-from buddyline.tools.bridge.placed import Placing, euler_covariance, euler_rad
+from buddyline.tools.bridge.placed import MAX_NODES, Placing, euler_covariance, euler_rad
 from msgspec.structs import replace
 
 from tests.tools.bridged import (
@@ -149,6 +149,13 @@ class TestPlacing:
         placed = take(Placing("b"), *INFOS.values(), oriented(), attitude("c", at(300)), estimate())
         assert placed is not None
         assert placed.behind_s == 0.0
+
+    def test_invented_nodes_do_not_fill_the_memory_and_keep_no_place_away(self) -> None:
+        placing = Placing("b", "a")
+        for k in range(1000):
+            assert take(placing, info(f"x{k}"), attitude(f"x{k}", at(5))) is None
+        assert len(placing._infos) == len(placing._attitudes) == MAX_NODES
+        assert take(placing, *INFOS.values(), oriented(), estimate()) is not None
 
     def test_other_pairs_are_not_taken(self) -> None:
         placing = Placing("b", "c")

@@ -317,8 +317,16 @@ class TestFrames:
         overview = Overview()
         for k in range(3000):
             take(overview, pose(0, node_a=f"a{k}", node_b=f"b{k}"), at(0))
+            take(overview, depth(f"c{k}", at(0)), at(0))
+            overview.alive(f"node/d{k}", alive=True, at_ns=at(0))
         assert len(overview.pairs()) <= 129
         assert len(overview.last) <= 1024
+        assert len(overview.nodes) == 64
+        # Those that were there before stay.
+        take(overview, depth("c0", at(1), 3.0), at(1))
+        held = overview.nodes["c0"].depth
+        assert held is not None
+        assert held.depth_m == 3.0
 
 
 class TestDive:

@@ -311,6 +311,24 @@ def test_over_the_bus_keys_tokens_and_sequence_are_those_of_rmw_zenoh(store: Any
     ]
 
 
+def test_no_more_topics_are_declared_than_a_team_has(store: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    from buddyline.protocol.zenoh_bus import open_hub, open_session
+
+    monkeypatch.setattr("buddyline.tools.ros2.MAX_TOPICS", 2)
+    endpoint = free_endpoint()
+    with open_hub(endpoint):
+        session: Any = open_session(endpoint, stop=threading.Event(), on_wait=lambda _: None)
+        try:
+            graph = RosGraph(session, store, ManualClock(5), domain=3)
+            for node in "ab":
+                graph.publish(translated(store, depth(node, at(0), 12.5))[0])
+            with pytest.raises(MessageError, match="there are 2 topics of ROS already"):
+                graph.publish(translated(store, depth("c", at(0), 12.5))[0])
+            graph.publish(translated(store, depth("a", at(1), 12.5))[0])
+        finally:
+            session.close()
+
+
 def test_messages_that_come_while_it_ends_are_no_fault(store: Any) -> None:
     from buddyline.protocol.zenoh_bus import connect, open_hub
 

@@ -7,6 +7,7 @@ under a boat), or the origin of a net. Camera frames become body frames here, an
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -27,6 +28,8 @@ MIN_RANGE_M: Final = 0.1
 # Of a position and a depth (m), and a velocity (m/s). Numbers of MAVLink are of single precision, and an autopilot
 # squares them.
 MOST: Final = 1e5
+# Of which infos and attitudes are kept, as far as it is not known which is the reference; a solver takes 16.
+MAX_NODES: Final = 64
 
 
 @dataclass(frozen=True)
@@ -122,9 +125,11 @@ class Placing:
         """Take one message of any topic."""
         message = envelope.message
         if isinstance(message, NodeInfo):
-            self._infos[message.node] = message
+            if self._follows(message.node, self._infos):
+                self._infos[message.node] = message
         elif isinstance(message, Attitude):
-            self._attitudes.setdefault(message.node, SampleStream(0)).add(message)
+            if self._follows(message.node, self._attitudes):
+                self._attitudes.setdefault(message.node, SampleStream(0)).add(message)
         elif isinstance(message, Depth):
             if message.node == self.vehicle and abs(message.depth_m) <= MOST:
                 self._depth_m = message.depth_m
@@ -134,6 +139,10 @@ class Placing:
         elif isinstance(message, Track | RelativePose) and self._net is None and self._is_ours(message):
             return self._in_pair(message)
         return None
+
+    def _follows(self, node: str, known: Collection[str]) -> bool:
+        """Return whether what a node says is kept: a client that invents nodes must not fill the memory."""
+        return node in known or len(known) < MAX_NODES or node in (self.vehicle, self._reference)
 
     def _is_ours(self, estimate: Estimate) -> bool:
         """Return whether an estimate is of our pair, and the best there is: a pose only where no track is fresh."""

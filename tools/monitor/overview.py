@@ -6,7 +6,7 @@ from typing import Final
 
 from buddyline.protocol.envelope import Envelope
 from buddyline.protocol.messages import NodePose
-from buddyline.tools.monitor.picture import NodePicture, PairPicture
+from buddyline.tools.monitor.picture import MAX_NODES, NodePicture, PairPicture, node_in
 from buddyline.tools.pairs import Pair
 
 # A client that invents pairs must not fill the memory.
@@ -33,10 +33,12 @@ class Overview:
             self.last[envelope.key] = envelope
         message, at_ns = envelope.message, envelope.time_ns
         if isinstance(message, NodePose):
-            if message.mode != "truth" and (message.node in self.net or len(self.net) < MAX_KEYS):
+            if message.mode != "truth" and (message.node in self.net or len(self.net) < MAX_NODES):
                 self.net[message.node] = message, at_ns
         elif len(envelope.ids) == 1:
-            self.nodes.setdefault(envelope.node, NodePicture(envelope.node)).take(envelope)
+            node = node_in(self.nodes, envelope.node)
+            if node is not None:
+                node.take(envelope)
         else:
             pair = envelope.node, envelope.ids[1]
             picture = self._first if self._first.pair in (None, pair) else self._others.get(pair)

@@ -41,6 +41,8 @@ from numpy.typing import NDArray
 KEPT_NS: Final = 150 * S_NS
 # Trail and plots have at most one pose, and one point of the track, in this time.
 POINT_SPACING_NS: Final = S_NS // 5
+# A client that invents nodes must not fill memory and page; a solver takes 16.
+MAX_NODES: Final = 64
 MAX_CANDIDATES: Final = 128
 MAX_REJECTED: Final = 8192
 # Marks of the survey's checks, not of persons.
@@ -194,6 +196,14 @@ class NodePicture:
         setattr(self, name, message)
 
 
+def node_in(nodes: dict[str, NodePicture], name: str) -> NodePicture | None:
+    """Return the state of a node, a new one where it is not known yet; None where there are too many."""
+    known = nodes.get(name)
+    if known is None and len(nodes) < MAX_NODES:
+        known = nodes[name] = NodePicture(name)
+    return known
+
+
 class PairPicture:
     """The state of one pair, and of all nodes.
 
@@ -229,7 +239,9 @@ class PairPicture:
         message, at_ns = envelope.message, envelope.time_ns
         self.heard(at_ns)
         if len(envelope.ids) == 1:
-            self.nodes.setdefault(envelope.node, NodePicture(envelope.node)).take(envelope)
+            node = node_in(self.nodes, envelope.node)
+            if node is not None:
+                node.take(envelope)
             return
         pair = envelope.node, envelope.ids[1]
         self.pair = self.pair or pair
@@ -260,7 +272,9 @@ class PairPicture:
             (self.solvers.add if alive else self.solvers.discard)(name)
             self.solver_left_ns = None if self.solvers else left_ns
         elif kind == "node" and (alive or node in self.nodes):
-            self.nodes.setdefault(node, NodePicture(node)).left_ns = left_ns
+            known = node_in(self.nodes, node)
+            if known is not None:
+                known.left_ns = left_ns
 
     def ends(self) -> tuple[str | None, str | None]:
         """Return the ids of A and B, as far as they are known."""
