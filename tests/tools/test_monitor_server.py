@@ -198,6 +198,38 @@ class TestFrames:
             assert "7.00 m" in changed["figures"]
             assert "3.00 m" in told(other, "figures")["figures"]
 
+    def test_after_this_machine_s_clock_was_set_back_nothing_from_before_counts_as_fresh(self) -> None:
+        hour = 3600 * S_NS
+        overview, clock = Overview(), ManualClock(at(29) + hour)
+        session, viewer = LiveSession(overview, clock), Viewer(live=True)
+
+        def shown() -> dict[str, Any]:
+            return viewer.frame(*session.step([])[:2])
+
+        for node in "ab":
+            take(overview, INFOS[node], at(0) + hour)
+        for k in range(30):
+            for message in tick(k):
+                take(overview, message, at(k) + hour)
+        viewer.choose_fields(["buddyline/node/a/depth depth_m"])
+        assert shown()["banner"]["level"] == "ok"
+        clock.set_ns(at(29))
+        assert shown()["banner"]["level"] != "ok"
+        # Trail, plots and health go on with what comes now.
+        said: dict[str, Any] = {}
+        points, probed = 0, 0
+        for k in range(30, 60):
+            for message in tick(k):
+                take(overview, message, at(k))
+            clock.set_ns(at(k))
+            frame = shown()
+            points += len(frame.get("points", []))
+            probed += "probes" in frame
+            said |= frame
+        assert said["banner"]["level"] == "ok"
+        assert points >= 10
+        assert probed == 30
+
     def test_no_text_says_that_all_is_well_once_the_banner_does_not(self) -> None:
         overview, viewer = filled(), Viewer(live=True)
         health = ""

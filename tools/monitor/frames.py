@@ -95,7 +95,7 @@ class Viewer:
         self._contents = {} if contents is None else contents
         self._shown: Pair | None = None
         self._told: dict[str, Any] = {}
-        self._point_ns = self._miss_ns = -1
+        self._point_ns = self._miss_ns = self._now_ns = -1
         self._reset = True
 
     def restart(self) -> None:
@@ -112,9 +112,11 @@ class Viewer:
     def frame(self, overview: Overview, now_ns: int) -> dict[str, Any]:
         """Return what is new for this viewer."""
         picture = overview.picture(self.pair)
-        if picture.pair != self._shown:
+        # Also where the clock was set back.
+        if picture.pair != self._shown or now_ns < self._now_ns - S_NS:
             self._shown = picture.pair
             self.restart()
+        self._now_ns = now_ns
         contents = self._contents.setdefault(picture.pair, PageContents(live=self._live))
         contents.update(overview, picture, now_ns, anew=self._reset)
         said: dict[str, Any] = {"now": now_ns / MS_NS}

@@ -96,6 +96,7 @@ class LiveSession:
     def step(self, commands: list[dict[str, Any]]) -> tuple[Overview, int, bool]:
         """Return what is watched, now. Those who ask together get the same instant."""
         now_ns = self._clock.now_ns()
+        self._overview.look_at_clock(now_ns)
         if not 0 <= now_ns - self._now_ns < TOGETHER_NS:
             self._now_ns = now_ns
         return self._overview, self._now_ns, False

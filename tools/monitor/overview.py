@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Final
 
+from buddyline.protocol.clock import S_NS
 from buddyline.protocol.envelope import Envelope
 from buddyline.protocol.messages import NodePose
-from buddyline.tools.monitor.picture import MAX_NODES, NodePicture, PairPicture, node_in
+from buddyline.tools.monitor.picture import MAX_NODES, NodePicture, PairPicture, node_in, passed
 from buddyline.tools.pairs import Pair
 
 # A client that invents pairs must not fill the memory.
@@ -49,6 +50,18 @@ class Overview:
                 picture.take(envelope)
         for picture in (self._first, *self._others.values()):
             picture.heard(at_ns)
+
+    def look_at_clock(self, now_ns: int) -> None:
+        """Notice a clock that was set back: what came before must not stay fresh for as long."""
+        last_ns = self._first.last_ns
+        if last_ns is None or now_ns >= last_ns - S_NS:
+            return
+        self.last = {key: one for key, one in self.last.items() if one.time_ns <= now_ns}
+        self.net = {node: (pose, passed(at_ns, now_ns)) for node, (pose, at_ns) in self.net.items()}
+        for node in self.nodes.values():
+            node.set_back(now_ns)
+        for picture in (self._first, *self._others.values()):
+            picture.set_back(now_ns)
 
     def alive(self, name: str, alive: bool, at_ns: int) -> None:
         """Take a change of the names that are alive."""

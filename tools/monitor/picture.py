@@ -182,6 +182,12 @@ class NodePicture:
         stamp_ns = self.image.stamp_ns
         return next((frame for frame in reversed(self.candidates) if frame.stamp_ns == stamp_ns), None)
 
+    def set_back(self, now_ns: int) -> None:
+        """Count what was heard later than now as old: this machine's clock was set back."""
+        self.heard_ns = {name: passed(at_ns, now_ns) for name, at_ns in self.heard_ns.items()}
+        self.problem_since_ns = min(self.problem_since_ns, now_ns)
+        self.left_ns = None if self.left_ns is None else min(self.left_ns, now_ns)
+
     def take(self, envelope: Envelope) -> None:
         """Take one of the node's messages."""
         message, name = envelope.message, envelope.topic.name.removeprefix("node_")
@@ -194,6 +200,11 @@ class NodePicture:
         if isinstance(message, NodeStatus) and _is_new_problem(self.status, message):
             self.problem_since_ns = envelope.time_ns
         setattr(self, name, message)
+
+
+def passed(at_ns: int, now_ns: int) -> int:
+    """Return a time; one later than now, of a clock that was set back, as one that is too old to count."""
+    return at_ns if at_ns <= now_ns else now_ns - KEPT_NS
 
 
 def node_in(nodes: dict[str, NodePicture], name: str) -> NodePicture | None:
@@ -263,6 +274,19 @@ class PairPicture:
         """Note that something has come at this time, of this pair or of another."""
         self.first_ns = at_ns if self.first_ns is None else self.first_ns
         self.last_ns = at_ns if self.last_ns is None else max(self.last_ns, at_ns)
+
+    def set_back(self, now_ns: int) -> None:
+        """Count what came later than now as old: this machine's clock was set back. Trail and plots begin anew."""
+        for name in ("pose_ns", "track_ns", "solver_ns", "solver_heard_ns"):
+            at_ns = getattr(self, name)
+            if at_ns is not None:
+                setattr(self, name, passed(at_ns, now_ns))
+        self.solver_problem_since_ns = min(self.solver_problem_since_ns, now_ns)
+        self.solver_left_ns = None if self.solver_left_ns is None else min(self.solver_left_ns, now_ns)
+        self.points.clear()
+        self.misses.clear()
+        self._kept_ns.clear()
+        self.first_ns = self.last_ns = now_ns
 
     def alive(self, name: str, alive: bool, at_ns: int) -> None:
         """Take a change of the names that are alive: `node/<id>` or `solver/...`."""
