@@ -109,7 +109,8 @@ def _take(recorded: Recorded, ids: tuple[str, ...], message: Message) -> None:
         getattr(recorded, _LISTS[type(message)]).append(message)
 
 
-def _simulated_clocks(logs: Sequence[Dive]) -> SimulatedClocks:
+def simulated_clocks(logs: Sequence[Dive]) -> SimulatedClocks:
+    """Return what `simulate` has noted of the clocks in the first log where they do not agree."""
     for log in logs:
         try:
             found = SimulatedClocks.of(log.metadata())
@@ -161,7 +162,7 @@ def load(paths: Sequence[str], truth_paths: Sequence[str] = (), pair: Pair | Non
             recorded.doubled += log.repeated.get("/".join(recorded.nodes), 0)
         for log in answering[:1]:
             curves = noted_curves(log.metadata(), log.name)
-            take_ned_truths(recorded, _simulated_clocks([*logs, *truth_logs]), curves)
+            take_ned_truths(recorded, simulated_clocks([*logs, *truth_logs]), curves)
             take_onto_common_clock(recorded, curves)
             recorded.problems += _clocks_apart(log, recorded.nodes, curves)
     return recorded

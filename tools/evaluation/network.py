@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from buddyline.protocol.errors import BuddylineError
@@ -14,6 +14,7 @@ from buddyline.protocol.messages import NodePose
 from buddyline.protocol.topics import NET_POSE, NET_TRUTH, POSE, REJECTED
 from buddyline.tools.clock_curves import noted_curves
 from buddyline.tools.dives import first_with_net, open_each
+from buddyline.tools.evaluation.logs import simulated_clocks
 from buddyline.tools.evaluation.rotation import conjugate, multiply, normalized, rotation_vector
 from buddyline.tools.evaluation.statistics import Stats
 from buddyline.tools.evaluation.truth import PoseHistory
@@ -24,6 +25,7 @@ from msgspec.structs import replace
 # A node's pose is wrong where it is off by more than this, and by more than WRONG_SIGMAS.
 WRONG_M: Final = 0.3
 WRONG_SIGMAS: Final = 3.0
+Ahead: TypeAlias = Callable[[str, int], int]
 
 
 @dataclass(frozen=True)
@@ -47,11 +49,13 @@ class NodeFigures:
     wrong: int
 
 
-def network_figures(poses: Sequence[NodePose], truths: Sequence[NodePose]) -> list[NodeFigures]:
+def network_figures(
+    poses: Sequence[NodePose], truths: Sequence[NodePose], ahead_ns: Ahead = lambda *_: 0
+) -> list[NodeFigures]:
     """Return the figures of each net's nodes that have truth, by net and node.
 
-    Where one node is the origin, which moves with it, places count from its true place; without its truth they do not
-    count.
+    Where one node is the origin, which moves with it, places count from its true place at the same instant; without its
+    truth they do not count. ahead_ns: a node's clock minus the first node's, at a stamp.
     """
     of_truth: dict[tuple[str, str], list[NodePose]] = defaultdict(list)
     for truth in truths:
@@ -67,7 +71,7 @@ def network_figures(poses: Sequence[NodePose], truths: Sequence[NodePose]) -> li
         if not any(pose.covariance[i] for i in (0, 7, 14)) and not pose.fixed:
             origins[pose.net, pose.stamp_ns] = pose.node
     return [
-        _figures(net, node, found, by_node, len(stamps[net]), origins)
+        _figures(net, node, found, by_node, len(stamps[net]), origins, ahead_ns)
         for (net, node), found in sorted(own.items())
         if node in by_node
     ]
@@ -80,13 +84,15 @@ def _figures(
     truth: dict[str, PoseHistory],
     count: int,
     origins: dict[tuple[str, int], str],
+    ahead_ns: Ahead,
 ) -> NodeFigures:
     rows = []
     for pose in counted(poses, f"evaluate {node}"):
         true = truth[node].at(pose.stamp_ns)
         zero_m = np.zeros(3)
         if (origin := origins.get((net, pose.stamp_ns))) is not None:
-            true_origin = truth[origin].at(pose.stamp_ns) if origin in truth else None
+            by_origin_ns = pose.stamp_ns + ahead_ns(origin, pose.stamp_ns) - ahead_ns(node, pose.stamp_ns)
+            true_origin = truth[origin].at(by_origin_ns) if origin in truth else None
             if true_origin is None:
                 continue
             zero_m = true_origin[0]
@@ -116,25 +122,30 @@ def _figures(
     )
 
 
-def load_network(paths: Sequence[str], truth_paths: Sequence[str]) -> tuple[list[NodePose], list[NodePose]]:
+def load_network(paths: Sequence[str], truth_paths: Sequence[str]) -> tuple[list[NodePose], list[NodePose], Ahead]:
     """Read the poses of all nodes, of the first log that has any, and their truth; raise BuddylineError for none.
 
     Each node's poses and truth are by its own clock; the truth is moved by the curves that the dive was solved with.
+    The last is how far a simulated dive's clocks are still apart then.
     """
     with ExitStack() as stack:
         logs, truth_logs = open_each(paths, stack), open_each(truth_paths, stack)
         solved = first_with_net(logs)
         poses = list(solved.all_of(NET_POSE, NodePose, doing=f"read {solved.name}"))
         curves = noted_curves(solved.metadata(), solved.name)
+        clocks = simulated_clocks([*logs, *truth_logs])
         truths: list[NodePose] = []
         for log in [*truth_logs, *logs]:
             truths += log.all_of(NET_TRUTH, NodePose, doing=f"read {log.name}")
     if not truths:
         named = ", ".join([*paths, *truth_paths])
         raise BuddylineError(f"{named}: no truth of the net's nodes; name its log with --truth T.mcap")
-    offsets_ns = [curves[one.node].offset_ns(one.stamp_ns) if one.node in curves else 0 for one in truths]
-    moved = [replace(one, stamp_ns=max(one.stamp_ns - ns, 0)) for one, ns in zip(truths, offsets_ns, strict=True)]
-    return poses, moved
+
+    def known_ns(node: str, stamp_ns: int) -> int:
+        return curves[node].offset_ns(stamp_ns) if node in curves else 0
+
+    moved = [replace(one, stamp_ns=max(one.stamp_ns - known_ns(one.node, one.stamp_ns), 0)) for one in truths]
+    return poses, moved, lambda node, stamp_ns: clocks.ahead_ns(node, stamp_ns) - known_ns(node, stamp_ns)
 
 
 def shows_network(paths: Sequence[str]) -> bool:
