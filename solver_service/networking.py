@@ -58,7 +58,10 @@ class NetTracker:
         self._nodes: list[str] = []
         self._settled_ns: dict[tuple[str, str], int] = {}
         self._first_ns: int | None = None
-        self._taken_ns = self._told_ns = -1
+        self._taken_ns = -1
+        # Of each node, by its own clock: up to when all was fed, and up to when rows were asked for.
+        self._fed_ns: list[int] = []
+        self._asked_ns: list[int] = []
         self.net = NET
         self._zero_m = np.zeros(3)
 
@@ -169,13 +172,27 @@ class NetTracker:
         return left + messages
 
     def _frontier_ns(self) -> int:
-        """Return up to when everything has come: outcomes, and samples of the sensors that have not stopped.
+        """Return up to when, by the net's clock, everything has come: outcomes, and samples of sensors that go on.
 
         A pair that is a second behind the newest outcome has stopped.
         """
-        newest_ns = max(self._settled_ns.values(), default=0)
-        pairs_ns = [ns for ns in self._settled_ns.values() if ns > newest_ns - STOPPED_NS]
-        return min([*pairs_ns, *(stream.complete_ns(newest_ns) for stream in self._streams.values())], default=0)
+        settled_ns = self._settled_by_net_ns
+        newest_ns = max(settled_ns, default=0)
+        complete_ns = [
+            stream.complete_ns(newest_ns + self._off_ns(node)) - self._off_ns(node)
+            for node, stream in self._streams.items()
+        ]
+        return min([*(ns for ns in settled_ns if ns > newest_ns - STOPPED_NS), *complete_ns], default=0)
+
+    @property
+    def _settled_by_net_ns(self) -> list[int]:
+        """The newest outcome of each pair: up to when, by the net's clock, the pictures of both nodes are here."""
+        return [ns - max(map(self._off_ns, pair)) for pair, ns in self._settled_ns.items()]
+
+    def _off_ns(self, node: str) -> int:
+        """Return a node's clock minus the net's, as believed."""
+        known = self._filter is not None and node in self._nodes
+        return self._filter.off_ns[self._nodes.index(node)] if known and self._filter is not None else 0
 
     def _take(self, fixes: Sequence[RelativePose], to_ns: int) -> list[Message]:
         self._meet(to_ns)
@@ -190,12 +207,19 @@ class NetTracker:
                 track.add_pair_fix(a, b, fix_of(fix), fix.trigger, candidates)
         if to_ns <= self._taken_ns:
             return self._with_left([])
+        told_ns = min(to_ns, max(self._settled_by_net_ns, default=to_ns))
+        asked: dict[int, list[int]] = {}
         for index, node in enumerate(self._nodes):
-            self._feed(track, index, self._streams[node], self._taken_ns + 1, to_ns)
-        told_ns = min(to_ns, max(self._settled_ns.values(), default=to_ns))
-        due = range(-(-(self._told_ns + 1) // self._period_ns), told_ns // self._period_ns + 1)
-        self._taken_ns, self._told_ns = to_ns, told_ns
-        rows = track.advance(to_ns, [k * self._period_ns for k in due if not k % self.one_in])
+            off_ns = track.off_ns[index]
+            self._feed(track, index, self._streams[node], self._fed_ns[index] + 1, to_ns + off_ns)
+            due = range(-(-(self._asked_ns[index] + 1) // self._period_ns), (told_ns + off_ns) // self._period_ns + 1)
+            for k in due:
+                if not k % self.one_in:
+                    asked.setdefault(k * self._period_ns, []).append(index)
+            self._fed_ns[index] = max(self._fed_ns[index], to_ns + off_ns)
+            self._asked_ns[index] = max(self._asked_ns[index], told_ns + off_ns)
+        self._taken_ns = to_ns
+        rows = track.advance(to_ns, asked.items())
         return self._with_left([self._message(row) for row in rows])
 
     def _meet(self, to_ns: int) -> None:
@@ -219,13 +243,15 @@ class NetTracker:
             info, rig = known[node]
             if self._filter is None:
                 self._filter = NetFilter(smooths=self._mode == "smooth")
-                self._taken_ns = self._told_ns = self._first_ns - S_NS
+                self._taken_ns = self._first_ns - S_NS
             self._infos[node] = info
             self._nodes.append(node)
             blink = None if info.blink is UNSET else info.blink
             self._filter.add_node(track_node_of(info, rig), self._place(info), shines=info.has_lights, blink=blink)
             # Its messages of the last second, from before it was known here.
             self._feed(self._filter, len(self._nodes) - 1, self._streams[node], self._taken_ns - S_NS, self._taken_ns)
+            self._fed_ns.append(self._taken_ns)
+            self._asked_ns.append(self._taken_ns)
 
     def _place(self, info: NodeInfo) -> KnownPlace | None:
         if info.fixed is UNSET:

@@ -173,8 +173,8 @@ def solved(messages: Sequence[Message], mode: str, hz: float) -> NetRun:
 
     noted, smoothed = NetEstimate.due_row, Told.smoothed
 
-    def due_row(self: NetEstimate, t_s: float, stamp_ns: int) -> DueNetRow | None:
-        found = noted(self, t_s, stamp_ns)
+    def due_row(self: NetEstimate, t_s: float, stamp_ns: int, nodes: Sequence[int]) -> DueNetRow | None:
+        found = noted(self, t_s, stamp_ns, nodes)
         if found is not None and self.state is not None:
             after, move, *_ = self._moved(t_s) if t_s - self.t_s > 1e-6 else (self.state, None)
             P = self.covariance if move is None else move.covariance(self.covariance)

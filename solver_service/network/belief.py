@@ -16,6 +16,8 @@ from buddyline.solver_service.network.shaking import NetShaking
 from buddyline.solver_service.network.state import (
     BLOCK,
     CLOCK,
+    CLOCK_WALK_S,
+    CLOCK_WALK_WITHOUT_S,
     DATUM,
     DEPTH_SCALE,
     GAUGE,
@@ -41,6 +43,7 @@ from buddyline.solver_service.track.intake import TrackIntake, newest_before
 from buddyline.solver_service.track.moving import (
     AWAY_RATE,
     HOLD_S,
+    KNOWN_CLOCK_S,
     TOGETHER_S,
     WITHOUT_RAD,
     WITHOUT_RADPS,
@@ -57,6 +60,10 @@ FREE_HEADING: Final = 1e6
 # How fast an attitude's slow error changes, as a share of its stated sigma per root s: as tracks of single pairs learn
 # it (0.44 to 0.50 on five dives without inertial units).
 WANDER: Final = 0.5
+# What may be left of a clock's offset that was known, 1 sd: the first member, whose clock is the net's, may be another.
+LEFT_S: Final = 0.02
+# How a node's speed changes while it is brought to another time.
+SPEEDS_UP_MPS2: Final = 0.3
 # All gauges are used together once the datum is known better than this, 1 sd.
 KNOWN_DATUM_M: Final = 10.0
 # How a node's errors move its attitude without an inertial unit: its own, and the slow error in the mount's place.
@@ -103,10 +110,10 @@ class NetBelief:
     """The state and covariance of all members, moved on by inertial samples and updated by the nodes' own sensors.
 
     intake: what all nodes have told. places: of the fixed nodes, by index. shaken: logs (2,) of the variances of nodes'
-    shaking, where an earlier pass has told them. walked: how far the units' biases walk, over what Noise has. members,
-    state, covariance, rates_radps, shaking and t_s: as they are now. trail: what led there, None where nothing is
-    smoothed. north_doubt: the variance, rad^2, that north has beside the covariance, as compasses contradict each
-    other.
+    shaking, where an earlier pass has told them. walked: how far the units' biases walk, over what Noise has. clocks:
+    of nodes whose clocks were known before, by how much these may be off, s, 1 sd. members, state, covariance,
+    rates_radps, shaking and t_s: as they are now. trail: what led there, None where nothing is smoothed. north_doubt:
+    the variance, rad^2, that north has beside the covariance, as compasses contradict each other.
     """
 
     def __init__(self, intake: TrackIntake) -> None:
@@ -114,6 +121,7 @@ class NetBelief:
         self.places: dict[int, KnownPlace] = {}
         self.shaken: dict[int, Floats] = {}
         self.walked = 1.0
+        self.clocks: dict[int, float] = {}
         self.members: list[Member] = []
         self.state: NetState | None = None
         self.covariance: Floats = np.zeros((0, 0))
@@ -136,6 +144,31 @@ class NetBelief:
     def anchor(self) -> int | None:
         """The member that the frame moves with; None where a fixed node holds it."""
         return 0 if not self.places else None
+
+    def clock(self, index: int) -> tuple[float, float]:
+        """Return how far a member's clock is ahead of what is believed, and 1 sd of that, s."""
+        assert self.state is not None
+        at = block(index).start + CLOCK
+        return float(self.state.clock_s[index]), math.sqrt(max(float(self.covariance[at, at]), 0.0))
+
+    @property
+    def clocks_now(self) -> list[tuple[float, float]]:
+        """All members' clocks, as `clock`."""
+        return [self.clock(index) for index in range(len(self.members))]
+
+    def nudge(self, index: int, more_s: float) -> None:
+        """Bring a member to where it is so little later by its own clock, which is by so much further ahead."""
+        assert self.state is not None
+        state, member = self.state, self.members[index]
+        p_m, R, clock_s = state.p_m.copy(), state.R.copy(), state.clock_s.copy()
+        p_m[index] += more_s * state.v_mps[index]
+        R[index] = R[index] @ rotation_exp(more_s * self.rates_radps[index])
+        clock_s[index] -= more_s
+        self.state = replace(state, p_m=p_m, R=R, clock_s=clock_s)
+        own = self.covariance[block(index), block(index)]
+        for of, off in ((V_, SPEEDS_UP_MPS2 * more_s), (P_, 0.5 * SPEEDS_UP_MPS2 * more_s**2), (PHI, 0.5 * more_s**2)):
+            own[of, of] += off**2 * np.eye(3)
+        member.attitude_s, member.depth_s = member.attitude_s - more_s, member.depth_s - more_s
 
     # Members
 
@@ -161,6 +194,8 @@ class NetBelief:
     def _add(self, member: Member, state: NetState, own: Floats, by: Floats | None = None) -> None:
         """Add a member with its covariance (BLOCK, BLOCK). by (BLOCK, N): its errors by those so far."""
         across = None if by is None else self.covariance @ by.T
+        if member.node in self.clocks:
+            own[CLOCK, CLOCK] = self.clocks[member.node] ** 2
         told = self.shaken.get(member.node)
         if told is not None:
             own[SHAKE, SHAKE], own[SHOVE, SHOVE] = (variance * np.eye(3) for variance in np.exp(told))
@@ -188,6 +223,10 @@ class NetBelief:
         if self.state is None:
             return
         was_anchor = self.anchor == index
+        member, (off_s, sigma_s) = self.members[index], self.clock(index)
+        self.clocks.pop(member.node, None)
+        if member.confirmed and sigma_s < KNOWN_CLOCK_S:
+            self.clocks[member.node] = math.hypot(off_s, sigma_s, LEFT_S)
         self.members = [self.members[i] for i in kept]
         if not self.members:
             self._note_chosen([])
@@ -271,6 +310,9 @@ class NetBelief:
                     if now:
                         # From now on the mount's place holds the compass's slow error.
                         Q[i, MOUNT.stop - 1, MOUNT.stop - 1] += self._heading_rad(self.members[i].node, to_s) ** 2
+        # The first member's clock is the net's.
+        walks_s = np.where(without, CLOCK_WALK_WITHOUT_S, CLOCK_WALK_S)
+        Q[1:, CLOCK, CLOCK] += walks_s[1:] ** 2 * (to_s - self.t_s)
         if self.anchor is None:
             return state, Move(F, Q), rates, without, drawn
         p, v = state.p_m[self.anchor], state.v_mps[self.anchor]

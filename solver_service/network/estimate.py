@@ -14,10 +14,11 @@ from buddyline.protocol.blinking import lit
 from buddyline.protocol.messages import Blink
 from buddyline.solver_service.geometry.rotation import Floats, Indices, rotation_log, skew
 from buddyline.solver_service.network.belief import Member, NetBelief
+from buddyline.solver_service.network.clocks import BETWEEN_MPS, BETWEEN_RADPS, seems_far
 from buddyline.solver_service.network.exclusive import share
 from buddyline.solver_service.network.rows import DueNetRow, NetRow, rows_of
-from buddyline.solver_service.network.sights import SightArrays, columns, light_positions
-from buddyline.solver_service.network.state import BLOCK, P_, PHI, V_, NetState, block, lone
+from buddyline.solver_service.network.sights import SightArrays, by_clocks_px2, columns, light_positions
+from buddyline.solver_service.network.state import BLOCK, CLOCK, P_, PHI, V_, NetState, block, lone
 from buddyline.solver_service.network.trail import Present, Told
 from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.association import NOWHERE_PX, Odds, doubt_of, odds_of
@@ -104,6 +105,7 @@ class NetEstimate(NetBelief):
         other.members = [replace(member) for member in self.members]
         other.detection = {pair: of.copy() for pair, of in self.detection.items()}
         other.lit_s = dict(self.lit_s)
+        other.clocks = dict(self.clocks)
         other.trail = None if self.trail is None else self.trail.copied()
         return other
 
@@ -174,7 +176,7 @@ class NetEstimate(NetBelief):
             )
 
         about = any(wide[kept[n]] and self._both_confirmed(bars[n]) for n, *_ in chosen)
-        self._update(bars, which, y, H, chosen, compared if about else None)
+        self._update(bars, which, y, H, chosen, by_clocks_px2(H, P[kept]), compared if about else None)
 
     def _both_confirmed(self, bar: Bar) -> bool:
         """Whether both members of a bar are confirmed."""
@@ -243,9 +245,12 @@ class NetEstimate(NetBelief):
         y: Floats,
         H: Floats,
         chosen: Sequence[tuple[int, int, int, float]],
+        more_px2: Floats,
         compared: Callable[[NetState], tuple[Floats, Floats]] | None = None,
     ) -> None:
         """Update by the lights chosen, each by bar, candidate, light and variance; which (B, WIDTH): as `columns`.
+
+        more_px2 (B,): what the clocks add to the variances.
 
         compared: gives y and H about another state, None where they are linear enough. After seconds without light one
         linear step from the prediction ends far from the lights, with the sigma of a sound one. These steps
@@ -257,7 +262,9 @@ class NetEstimate(NetBelief):
             for member in (self.members[bar.other], self.members[bar.observer]):
                 member.light_s = max(member.light_s, bar.sight.t_s)
             self.members[bar.observer].looks_away = False
-        counted = variances * [self._lasting_factor(bars[bar], candidate, of) for bar, candidate, of, _ in chosen]
+        counted = (variances + more_px2[n]) * [
+            self._lasting_factor(bars[bar], candidate, of) for bar, candidate, of, _ in chosen
+        ]
         sigma_px = [float(bars[bar].sight.sigma_px[candidate]) for bar, candidate, *_ in chosen]
         doubts = np.repeat([doubt_of(one, sigma) for one, sigma in zip(variances.tolist(), sigma_px, strict=True)], 2)
         pictures = np.array([id(bars[one].sight) for one in n])
@@ -343,7 +350,7 @@ class NetEstimate(NetBelief):
         by_fix[P_, :3], by_fix[P_, 3:], by_fix[PHI, 3:] = R_i, skew(p) @ R_i, R_i
         by_member = np.zeros((BLOCK, len(self.covariance)))
         by_member[P_, block(index)][:, P_] = by_member[PHI, block(index)][:, PHI] = np.eye(3)
-        own += by_fix @ (fix.covariance + np.diag([1e-4] * 3 + [1e-5] * 3)) @ by_fix.T
+        own += by_fix @ (fix.covariance + self._beside_fix(fix, index, float(own[CLOCK, CLOCK]))) @ by_fix.T
         own += by_member @ self.covariance @ by_member.T
         seen = newest_before(self.intake.attitudes[node], t_s + HOLD_S)
         if seen is not None and t_s - seen[0] < 1.0:
@@ -367,26 +374,40 @@ class NetEstimate(NetBelief):
         H[:3, 6:9], H[:3, 9:12] = toward, -toward @ skew(state.p_m[two])
         H[3:, 3:6], H[3:, 9:12] = -toward, toward
         which = np.concatenate([block(member).start + _POSE for member in (one, two)])
-        S = H @ self.covariance[which[:, None], which] @ H.T + fix.covariance + np.diag([1e-4] * 3 + [1e-5] * 3)
+        _, sigma_s = self.clock(two)
+        beside = self._beside_fix(fix, one, sigma_s**2 + float(state.clock_s[two]) ** 2)
+        S = H @ self.covariance[which[:, None], which] @ H.T + fix.covariance + beside
         return gap, float(gap @ np.linalg.solve(S, gap))
+
+    def _beside_fix(self, fix: PairFix, index: int, square_s2: float) -> Floats:
+        """Give what a pose's covariance leaves out. index: its one member. square_s2: mean square of how far the other
+        node's clock is off what is believed."""
+        off_s, sigma_s = self.clock(index)
+        apart_s = 1e-9 * (self.intake.ahead_ns(fix.other) - self.intake.ahead_ns(fix.node))
+        squares_s2 = apart_s**2 + off_s**2 + sigma_s**2 + square_s2
+        moved = np.repeat((BETWEEN_MPS, BETWEEN_RADPS), 3) ** 2 * squares_s2
+        beside: Floats = np.diag([1e-4] * 3 + [1e-5] * 3) + np.diag(moved)
+        return beside
 
     # Rows
 
-    def due_row(self, t_s: float, stamp_ns: int) -> DueNetRow | None:
-        """Note what the confirmed members' row is made of, at a time at or after the last picture's; None before it."""
+    def due_row(self, t_s: float, stamp_ns: int, nodes: Sequence[int]) -> DueNetRow | None:
+        """Note what confirmed members' rows are made of, at a time at or after the last picture's; None before it."""
         if self.state is None or not self._ticks_to(t_s):
             return None
         way = self._way(t_s) if t_s - self.t_s > 1e-6 else None
-        return DueNetRow(stamp_ns, self._present(t_s), self.state, self.covariance, way, self.anchor, self.north_doubt)
+        return DueNetRow(
+            stamp_ns, self._present(t_s, nodes), self.state, self.covariance, way, self.anchor, self.north_doubt
+        )
 
-    def ask(self, t_s: float, stamp_ns: int) -> None:
+    def ask(self, t_s: float, stamp_ns: int, nodes: Sequence[int]) -> None:
         """Note that `smoothed` is to give a row of a time at or after the last picture's, and go on to there."""
         assert self.trail is not None
         if self.state is None or not self._ticks_to(t_s):
             return
         if t_s - self.t_s > 1e-6:
             self._go(t_s)
-        present = self._present(t_s)
+        present = self._present(t_s, nodes)
         self.trail.events.append(Told.of(t_s, stamp_ns, present, self.state, self.covariance, self.north_doubt))
 
     def _ticks_to(self, t_s: float) -> bool:
@@ -401,7 +422,8 @@ class NetEstimate(NetBelief):
         A member that is confirmed now was right before.
         """
         assert self.trail is not None
-        sure = {(member.node, member.since_s) for member in self.members if member.confirmed}
+        now = [index for index, member in enumerate(self.members) if member.confirmed and self.is_timed(index)]
+        sure = {(self.members[index].node, self.members[index].since_s) for index in now}
         rows: list[list[NetRow]] = []
         for told, state, own in self.trail.smoothed(len(self.covariance)):
             sure |= {(one.node, one.since_s) for one in told.members if one.confirmed}
@@ -411,8 +433,34 @@ class NetEstimate(NetBelief):
                 rows.append(rows_of([told.stamp_ns] * n, present, state, own, np.full(n, told.north_doubt)))
         return [row for of_time in reversed(rows) for row in of_time]
 
-    def _present(self, t_s: float) -> list[Present]:
+    def _present(self, t_s: float, nodes: Sequence[int]) -> list[Present]:
         return [
-            Present(one.node, one.since_s, one.confirmed, max(t_s - max(one.light_s, one.since_s), 0.0))
-            for one in self.members
+            Present(
+                one.node,
+                one.since_s,
+                one.confirmed and self.is_timed(index),
+                max(t_s - max(one.light_s, one.since_s), 0.0),
+                one.node in nodes,
+            )
+            for index, one in enumerate(self.members)
         ]
+
+    def is_timed(self, index: int) -> bool:
+        """Whether no clock seems so far off that a member's rows are not to be told.
+
+        A fixed node's place does not depend on its clock. Where the frame moves with a node, each clock moves all.
+        """
+        if self.members[index].node in self.places:
+            return True
+        return not any(map(self.is_far, range(len(self.members)) if self.anchor is not None else [index]))
+
+    def is_far(self, index: int) -> bool:
+        """Whether a member's clock seems too far off for what is made of its lights.
+
+        Without an inertial unit it is not known well enough to be put right.
+        """
+        off_s, sigma_s = self.clock(index)
+        member, first = self.members[index], self.members[0]
+        if member.without:
+            off_s += 1e-9 * (self.intake.ahead_ns(member.node) - self.intake.ahead_ns(first.node))
+        return seems_far(off_s, sigma_s)

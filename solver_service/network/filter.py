@@ -21,10 +21,11 @@ from buddyline.solver_service.geometry.rotation import rotation_log, skew
 from buddyline.solver_service.network.belief import KnownPlace
 from buddyline.solver_service.network.estimate import CONTRADICTS, Candidate, NetEstimate, PairFix
 from buddyline.solver_service.network.fixed import FixedWatch
+from buddyline.solver_service.network.intake import NetIntake
 from buddyline.solver_service.network.rows import DueNetRow, NetRow, make_rows
 from buddyline.solver_service.network.trail import NetTrail
 from buddyline.solver_service.track.inputs import FixSeen, TrackNode
-from buddyline.solver_service.track.intake import CHECK_EVERY_S, TrackIntake, newest_before
+from buddyline.solver_service.track.intake import CHECK_EVERY_S, newest_before
 from buddyline.solver_service.track.lights import Sight
 from buddyline.solver_service.track.moving import HOLD_S, TOGETHER_S
 from buddyline.solver_service.track.problems import Problems
@@ -58,31 +59,28 @@ REHEARSED_S: Final = 20.0
 # How far biases may walk, over what Noise has: as those of poor units, as those of good ones, and between. What
 # explains the dive's beginning better counts more.
 WALKS: Final = np.array((2.0, 0.8, 0.32))
+# The dive's beginning is passed over again, by clocks that the pass before has put right, so often at most.
+CLOCK_TRIALS: Final = 3
 # Rows come after all else of their time.
 ROW: Final = 1 << 20
 
 
-class NetFilter(TrackIntake):
+class NetFilter(NetIntake):
     """The network of nodes. Samples and events may be added in any order before `advance` passes them.
 
     smooths: rows come later, by all that was seen in the LATER_S after each, or up to the end.
     """
 
-    nodes: list[TrackNode]
-
     def __init__(self, *, smooths: bool = False) -> None:
-        super().__init__([])
-        self.main = NetEstimate(self)
+        super().__init__()
         self.smooths = smooths
-        self._rehearses = smooths
+        self._rehearses, self._learns_clocks = smooths, True
         # Up to when all has been added.
         self._end_s = -np.inf
         if smooths:
             self.main.trail = NetTrail()
         # Up to when rows have been smoothed.
         self._smoothed_s = -np.inf
-        self.challengers: list[NetEstimate] = []
-        self._fixes: dict[tuple[int, int], list[tuple[float, PairFix]]] = {}
         # By trigger: the poses that are taken into account, or will be.
         self._together: dict[int, list[PairFix]] = {}
         self._challenged_s: dict[tuple[int, int], float] = {}
@@ -102,6 +100,7 @@ class NetFilter(TrackIntake):
         self.attitudes.append([])
         self.depths.append([])
         self._rejected.append(0)
+        self.off_ns.append(0)
         index = len(self.nodes) - 1
         self.turning.append(self._turning_of(index))
         if place is not None:
@@ -116,15 +115,17 @@ class NetFilter(TrackIntake):
             self.main.blinks[index] = blink
         return index
 
-    def advance(self, to_ns: int, outputs_ns: Sequence[int] = ()) -> list[NetRow]:
-        """Go on to to_ns, up to which all has been added; return the network at the asked stamps in between.
+    def advance(self, to_ns: int, asked: Iterable[tuple[int, Sequence[int]]] = ()) -> list[NetRow]:
+        """Go on to to_ns, by the net's clock, up to which all has been added; return the rows asked for in between.
+
+        asked: stamps, by the nodes' own clocks, and the nodes.
 
         Events within HOLD_S of to_ns wait for the next call, so that the result does not depend on how often it is
         called.
         """
-        self._end_s = self.seconds(0, to_ns) - HOLD_S
-        for stamp_ns in outputs_ns:
-            self._push(self.seconds(0, stamp_ns), ROW, stamp_ns)
+        self._end_s = self.since_epoch(to_ns) - HOLD_S
+        for stamp_ns, nodes in asked:
+            self.ask_rows(stamp_ns, nodes, ROW)
         if self._rehearses and (not self._events or self._end_s < self._events[0][0] + REHEARSED_S):
             return []
         return self._go_on(self._end_s)
@@ -136,15 +137,18 @@ class NetFilter(TrackIntake):
         due: list[DueNetRow] = []
         while self._events and self._events[0][0] <= end_s:
             t_s, _, _, what = heapq.heappop(self._events)
-            if isinstance(what, int) and self.smooths:
+            if isinstance(what, tuple) and self.smooths:
                 rows += self._ask(t_s, what)
-            elif isinstance(what, int):
-                row = self.main.due_row(t_s, what)
+            elif isinstance(what, tuple):
+                row = self.main.due_row(t_s, what[0], what[1:])
                 due += [row] if row is not None else []
             elif isinstance(what, PairFix):
                 self._take_fix(t_s, what)
             elif isinstance(what, Sight):
                 self._take_sights(t_s, [what, *self._beside(t_s)])
+                if self._learns_clocks and self._put_clocks_right():
+                    # What came by a clock that is ahead, since, comes with the next call.
+                    break
         self._forget_before(end_s - MEMORY_S)
         return rows + make_rows(due)
 
@@ -157,15 +161,24 @@ class NetFilter(TrackIntake):
             del self._together[trigger]
 
     def finish(self) -> list[NetRow]:
-        """Return the rows that have not been smoothed yet, at the end of the dive."""
-        return self._go_on(self._end_s) + self._smooth(np.inf) if self.smooths else []
+        """Return the rows that are left, at the end of the dive."""
+        rows = self._go_on(self._end_s)
+        # It stops where a clock is put right.
+        while self._events and self._events[0][0] <= self._end_s:
+            rows += self._go_on(self._end_s)
+        return rows + (self._smooth(np.inf) if self.smooths else [])
 
     def _rehearse(self) -> None:
         """Learn how the units are shaken and biases walk from the dive's beginning, whose own rows need it already."""
         self._rehearses = False
         if not self._events:
             return
-        trials = [self._trial(float(walked)) for walked in WALKS]
+        first = self._trial(float(WALKS[0]))
+        for _ in range(CLOCK_TRIALS):
+            if not self._put_right_by(first):
+                break
+            first = self._trial(float(WALKS[0]))
+        trials = [first, *(self._trial(float(walked)) for walked in WALKS[1:])]
         evidence = np.array([trial.evidence for trial in trials])
         weights = np.exp(evidence - evidence.max())
         best = trials[evidence.argmax()]
@@ -176,7 +189,7 @@ class NetFilter(TrackIntake):
     def _trial(self, walked: float) -> NetEstimate:
         """Return where the dive's beginning leads if biases walk so far."""
         trial = copy.copy(self)
-        trial.smooths, trial.main = False, self.main.copied()
+        trial.smooths, trial._learns_clocks, trial.main = False, False, self.main.copied()
         trial.main.trail, trial.main.walked = None, walked
         trial.challengers, trial._watches, trial._problems = [], {}, Problems()
         trial._fixes, trial._challenged_s, trial._contradicted = {}, {}, {}
@@ -188,10 +201,10 @@ class NetFilter(TrackIntake):
         self._pictured_s.clear()
         return trial.main
 
-    def _ask(self, t_s: float, stamp_ns: int) -> list[NetRow]:
+    def _ask(self, t_s: float, what: tuple[int, ...]) -> list[NetRow]:
         """Note that a row is to be smoothed; return those that can be by now."""
         for estimate in [self.main, *self.challengers]:
-            estimate.ask(t_s, stamp_ns)
+            estimate.ask(t_s, what[0], what[1:])
         if self._smoothed_s == -np.inf:
             self._smoothed_s = t_s - TOGETHER_S
         return self._smooth(t_s - LATER_S) if t_s - self._smoothed_s >= 2.0 * LATER_S else []
@@ -238,6 +251,7 @@ class NetFilter(TrackIntake):
             self._watched_s = t_s
             self._check_fixed(t_s)
             self._check_compasses(t_s)
+            self._check_clocks(t_s)
         for sight in sights:
             self._hear(sight.node, t_s)
         if self.main.state is None and self.main.places:
@@ -314,6 +328,7 @@ class NetFilter(TrackIntake):
                 continue
             challenger.start_s = t_s
             challenger.remove(index)
+            challenger.clocks.pop(node, None)
             _enter(challenger, t_s, fix)
             if challenger.member_of(node) is not None:
                 self.challengers.append(challenger)

@@ -165,7 +165,7 @@ def rows_of(
             age_s=member.age_s,
         )
         for k, (stamp_ns, member, well) in enumerate(zip(stamps_ns, members, known.tolist(), strict=True))
-        if member.confirmed and well
+        if member.confirmed and member.asked and well
     ]
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, Indices, skew
 from buddyline.solver_service.network.state import BLOCK, CLOCK, COMMON, P_, PHI, V_, NetState
 from buddyline.solver_service.track.lights import Sight, turns_over
+from buddyline.solver_service.track.moving import KNOWN_CLOCK_S
 
 # The errors of the observer, then of the other node, that move a light: of each place, velocity, attitude and clock.
 OF_NODE: Final = np.r_[P_, V_, PHI, CLOCK]
@@ -62,6 +63,26 @@ def light_positions(
     seen_moving = (toward @ (moving - state.v_mps[i][:, None, None])[..., None])[..., 0]
     D[..., WIDTH] = seen_moving + X @ skew(rates_radps[i])[:, None]
     return X, D
+
+
+def by_clocks_px2(H: Floats, P: Floats) -> Floats:
+    """Give the variances (B,), px^2, that Jacobians H (B, K, L, 2, C) leave out of the clocks: lights move by c v.
+
+    P (B, C, C): of the errors of `columns`. Of the product of two unknown ones that is var c var v + cov(c, v)^2. Where
+    the clocks are known it is nothing.
+    """
+    half = WIDTH // 2
+    clock, v = np.zeros(P.shape[-1]), slice(half + 3, half + 6)
+    clock[half + 9], clock[9] = 1.0, -1.0
+    with_all = P @ clock
+    variance_s2 = with_all @ clock
+    if not H.shape[1] or (variance_s2 < KNOWN_CLOCK_S**2).all():
+        return np.zeros(len(P))
+    along = with_all[:, v]
+    unknown = variance_s2[:, None, None] * P[:, v, v] + along[:, :, None] * along[:, None]
+    by_place = H[:, 0, 0, :, half : half + 3]
+    moved: Floats = 0.5 * np.trace(by_place @ unknown @ by_place.swapaxes(1, 2), axis1=1, axis2=2)
+    return moved
 
 
 class SightArrays:

@@ -48,8 +48,11 @@ MOVING: Final = 15
 POSED: Final = PHI.stop
 """The first errors of a block, of what a pose is made of: place, velocity and attitude."""
 
-# Clocks kept by chrony differ by less than this, 1 sd; so do others after `align` or `--clock-offset`.
-CLOCK_S: Final = 0.01
+# How far a node's clock may be off, 1 sd, and by how much this changes in a root second: quartz clocks drift. Attitudes
+# alone, without an inertial unit, tell it worse than they seem to.
+CLOCK_S: Final = 0.1
+CLOCK_WALK_S: Final = 1e-4
+CLOCK_WALK_WITHOUT_S: Final = 3e-3
 # Each depth gauge's own offset, and the distance of the frame's zero from the surface, 1 sd.
 GAUGE_M: Final = 0.1
 DATUM_M: Final = 1000.0

@@ -88,12 +88,13 @@ class Chosen:
 
 @dataclass(frozen=True)
 class Present:
-    """A member at a row's time. since_s: when it became one."""
+    """A member at a row's time. since_s: when it became one. asked: whether the row is of it."""
 
     node: int
     since_s: float
     confirmed: bool
     age_s: float
+    asked: bool = True
 
 
 @dataclass(frozen=True, eq=False)

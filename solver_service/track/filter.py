@@ -134,7 +134,7 @@ class TrackFilter(TrackPool):
                     yield row
             elif isinstance(what, FixSeen):
                 self._take_fix(t_s, what)
-            else:
+            elif isinstance(what, Sight):
                 self._take_sight(t_s, what)
         if math.isinf(self._keep_s):
             # Without rows in between, an estimate stays where the last picture was.

@@ -6,7 +6,7 @@ import bisect
 import heapq
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final, TypeVar
+from typing import Final, TypeAlias, TypeVar
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
@@ -40,6 +40,8 @@ UNTOLD_SIGMA_RAD: Final = np.radians((1.5, 1.5, 6.0))
 # No fix's numbers, in m, rad and their squares, are as large.
 BEYOND: Final = 1e4
 Seen = TypeVar("Seen", AttitudeSeen, DepthSeen)
+# A picture, a fix, or a row that is asked for: its stamp, in a network with the nodes that it is asked of behind.
+What: TypeAlias = Sight | FixSeen | int | tuple[int, ...]
 
 
 class TrackIntake:
@@ -58,7 +60,7 @@ class TrackIntake:
         self.samples = [Samples() for _ in nodes]
         self.attitudes: list[list[tuple[float, AttitudeSeen]]] = [[] for _ in nodes]
         self.depths: list[list[tuple[float, DepthSeen]]] = [[] for _ in nodes]
-        self._events: list[tuple[float, int, int, Sight | FixSeen | int]] = []
+        self._events: list[tuple[float, int, int, What]] = []
         self.turning = list(map(self._turning_of, range(len(nodes))))
         self._count = 0
         self._checked_s = -np.inf
@@ -72,9 +74,17 @@ class TrackIntake:
 
     def seconds(self, node: int, stamp_ns: int) -> float:
         """Give a stamp of a node as s since the epoch, on A's clock as first believed."""
+        return self.since_epoch(stamp_ns - self.ahead_ns(node))
+
+    def since_epoch(self, stamp_ns: int) -> float:
+        """Give a stamp of the common clock, A's, as s since the epoch."""
         if self.epoch_ns is None:
             self.epoch_ns = stamp_ns - stamp_ns % 86_400_000_000_000
-        return (stamp_ns - (self.clock_ns if node else 0) - self.epoch_ns) * 1e-9
+        return (stamp_ns - self.epoch_ns) * 1e-9
+
+    def ahead_ns(self, node: int) -> int:
+        """Give a node's clock minus A's, as first believed."""
+        return self.clock_ns if node else 0
 
     def stamp_ns(self, t_s: float) -> int:
         """Give the stamp of A's clock at a time since the epoch."""
@@ -95,7 +105,7 @@ class TrackIntake:
             return
         self.seconds(node, int(stamps_ns[0]))
         assert self.epoch_ns is not None
-        times_s = np.asarray(stamps_ns - (self.clock_ns if node else 0) - self.epoch_ns, np.float64) * 1e-9
+        times_s = np.asarray(stamps_ns - self.ahead_ns(node) - self.epoch_ns, np.float64) * 1e-9
         R_body_camera = self.nodes[node].rig.R_body_camera
         with np.errstate(invalid="ignore", over="ignore"):
             values = np.hstack((accel_mps2 @ R_body_camera, gyro_radps @ R_body_camera))
@@ -137,13 +147,15 @@ class TrackIntake:
         """Take a pose that one trigger's lights gave by themselves; one out of numeric range is left out."""
         numbers = np.concatenate((fix.t_a_b_m.ravel(), fix.R_a_b.ravel(), fix.covariance.ravel()))
         if not np.isfinite(numbers).all() or np.abs(numbers).max() > BEYOND:
-            self._problems.report(
-                f"{self.both}: fixes out of numeric range are left out", self.pair_seconds(fix.stamp_ns)
-            )
+            self._problems.report(f"{self.both}: fixes out of numeric range are left out", self.fix_seconds(fix))
             return
-        self._push(self.pair_seconds(fix.stamp_ns), 0, fix)
+        self._push(self.fix_seconds(fix), 0, fix)
 
-    def _push(self, t_s: float, rank: int, what: Sight | FixSeen | int) -> None:
+    def fix_seconds(self, fix: FixSeen) -> float:
+        """Give a fix's time since the epoch."""
+        return self.pair_seconds(fix.stamp_ns)
+
+    def _push(self, t_s: float, rank: int, what: What) -> None:
         """Have something taken at t_s. rank: the order at one time: fixes, then pictures by node, then asked rows."""
         # The count keeps two of a rank at one time in their order: they cannot be compared.
         self._count += 1

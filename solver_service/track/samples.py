@@ -166,6 +166,11 @@ class Samples:
             self._t[:kept], self._values[:kept] = self._t[first : self._count], self._values[first : self._count]
             self._count = kept
 
+    def put_back(self, by_s: float) -> None:
+        """Take all samples for so much earlier: their clock is ahead."""
+        self._t[: self._count] -= by_s
+        self._false = self._false[0] - by_s, self._false[1]
+
     def between(self, start_s: float, end_s: float, known_s: float) -> tuple[Floats, Floats, Bools]:
         """Give the grid (M,) from start_s to end_s, the values (M, 13) there, and which intervals are told (M - 1,).
 

@@ -112,9 +112,18 @@ def test_poses_and_track_of_a_dive_solved_with_its_clocks_are_right(dive, tmp_pa
     assert track.position_m.median < 0.01
 
 
-def test_a_network_whose_clocks_differ_is_right(tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("frame", "offset_ms"),
+    [
+        (["--fixed", "a"], 15),
+        # Of a frame that moves with a node, too, places count from where that is at the same instant.
+        pytest.param([], 15, marks=pytest.mark.slow),
+        pytest.param([], 200, marks=pytest.mark.slow),
+    ],
+)
+def test_a_network_whose_clocks_differ_is_right(tmp_path, capsys, frame, offset_ms):
     dive, out = tmp_path / "dive.mcap", tmp_path / "out.mcap"
-    words = ["--nodes", "3", "--fixed", "a", "--seconds", "20", "--seed", "6", "--imu", "--clock-offset-ms", "15"]
+    words = ["--nodes", "3", *frame, "--seconds", "20", "--seed", "6", "--imu", "--clock-offset-ms", str(offset_ms)]
     assert main(["simulate", str(dive), *words]) == 0
     assert main(["solve", str(dive), "-o", str(out)]) == 0
     capsys.readouterr()

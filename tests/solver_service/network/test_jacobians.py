@@ -18,6 +18,7 @@ from buddyline.solver_service.network.state import (
     ACCEL_BIAS,
     BLOCK,
     CLOCK,
+    CLOCK_S,
     COMMON,
     DATUM,
     DEPTH_SCALE,
@@ -197,13 +198,13 @@ def test_lights_of_one_picture_share_the_error_of_its_stamp_whosever_they_are(mo
     applied: list[tuple[Floats, Floats]] = []
     monkeypatch.setattr(NetEstimate, "_apply", lambda _, rows, __, noise, *___: applied.append((rows, noise)))
     estimate.lit_s[1, 2, 0] = -0.1
-    estimate._update(bars, which, y, H, [(n, 0, n % 2, 0.5) for n in range(3)])
+    estimate._update(bars, which, y, H, [(n, 0, n % 2, 0.5) for n in range(3)], np.zeros(3))
     [(rows, noise)] = applied
     late = STAMP_SIGMA_S * np.concatenate([H[n, 0, n % 2, :, -1] for n in range(3)])
     expected = 0.5 * np.eye(6) + np.outer(late, late)
     expected[:4, 4:] = expected[4:, :4] = 0.0
     estimate.members[2].without = True
-    estimate._update(bars, which, y, H, [(n, 0, n % 2, 0.5) for n in range(3)])
+    estimate._update(bars, which, y, H, [(n, 0, n % 2, 0.5) for n in range(3)], np.zeros(3))
     assert applied[1][1] == pytest.approx(expected)
     expected[4:, 4:] += 2.0 * 0.5 * np.eye(2)
     assert noise == pytest.approx(expected)
@@ -274,7 +275,9 @@ def test_the_gap_of_a_pose_counts_both_nodes_errors() -> None:
         return np.concatenate((t_now - t, rotation_log(R_now @ R.T)))
 
     H = differences(seen, COMMON + 3 * BLOCK)
-    S = H @ H.T + 1e-6 * np.eye(6) + np.diag([1e-4] * 3 + [1e-5] * 3)
+    # The pictures of a pose may have been taken apart, by both clocks' errors, while nodes move by 0.3 m/s and rad/s.
+    apart_s2 = 2.0 + float(np.sum(state.clock_s[1:] ** 2))
+    S = H @ H.T + 1e-6 * np.eye(6) + np.diag([1e-4] * 3 + [1e-5] * 3) + 0.09 * apart_s2 * np.eye(6)
     assert chi2 == pytest.approx(gap @ np.linalg.solve(S, gap), rel=1e-6)
 
 
@@ -317,6 +320,9 @@ def test_a_node_that_joins_has_the_errors_of_who_sees_it() -> None:
     which = np.r_[0:3, 6:9]
     cross = skew(estimate.state.p_m[3])
     small = np.zeros((6, 6))
-    small[:3, :3] = (1e-4 + 1e-8) * np.eye(3) + (1e-5 + 1e-8) * cross @ cross.T
+    # The pictures of a pose may have been taken apart, by both clocks' errors, while nodes move by 0.3 m/s and rad/s.
+    clock = block(1).start + CLOCK
+    moved = 0.09 * (CLOCK_S**2 + P[clock, clock] + state.clock_s[1] ** 2)
+    small[:3, :3] = (1e-4 + 1e-8 + moved) * np.eye(3) + (1e-5 + 1e-8 + moved) * cross @ cross.T
     assert own[np.ix_(which, which)][:3, :3] == pytest.approx((J @ P @ J.T)[:3, :3] + small[:3, :3], abs=1e-7)
     assert estimate.covariance[: len(P), block(3)][:, which] == pytest.approx(P @ J.T, abs=1e-7)

@@ -31,7 +31,7 @@ def estimate(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
 
 def test_rows_are_where_a_step_of_all_members_leads(estimate: NetEstimate) -> None:
     times_s = [estimate.t_s + ahead_s for ahead_s in (0.0, 0.03, 0.08)]
-    due = [one for k, t_s in enumerate(times_s) if (one := estimate.due_row(t_s, k)) is not None]
+    due = [one for k, t_s in enumerate(times_s) if (one := estimate.due_row(t_s, k, range(4))) is not None]
     rows = {(row.stamp_ns, row.node): row for row in make_rows(due)}
     assert len(rows) == 3 * len(estimate.members) == 12
     alone = {(row.stamp_ns, row.node): row for one in due for row in make_rows([one])}
