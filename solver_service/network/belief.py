@@ -61,7 +61,7 @@ FREE_HEADING: Final = 1e6
 # it (0.44 to 0.50 on five dives without inertial units).
 WANDER: Final = 0.5
 # What may be left of a clock's offset that was known, 1 sd: the first member, whose clock is the net's, may be another.
-LEFT_S: Final = 0.02
+LEFT_S: Final = 0.01
 # How a node's speed changes while it is brought to another time.
 SPEEDS_UP_MPS2: Final = 0.3
 # All gauges are used together once the datum is known better than this, 1 sd.
