@@ -1,4 +1,4 @@
-"""What `tests.net_figures` tells the network of each grade of units; `python -m tests.net_figures` takes minutes."""
+"""What `net_figures` and `track_figures --told` tell estimates of each grade of units; those programs take minutes."""
 
 import math
 
@@ -7,9 +7,15 @@ import pytest
 from buddyline.node.sim.inertial import GRADES, WALK_S
 from buddyline.node.sim.randomness import Sway
 from buddyline.solver_service.network import shaking, state
+from buddyline.solver_service.track import start
+from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.samples import Samples
+from buddyline.solver_service.track.walking import Walking
 
-from tests.net_figures import WALKED, told
+from tests.net_figures import told
+from tests.solver_service.track.dives import Setting, make
+from tests.told_units import WALKED
+from tests.track_figures import KNOWN_S, told_units
 
 
 def sigmas():
@@ -25,6 +31,25 @@ def test_the_simulators_own_sigmas_are_told_and_taken_back(name):
         assert sigmas() == pytest.approx((grade.lever_sigma_m, shaken_rad, WALKED * grade.gyro_walk_radps))
     assert lever_m != grade.lever_sigma_m
     assert sigmas() == before
+
+
+def of_track(nodes):
+    return (
+        start.LEVER_TOLD_M,
+        *Walking().densities[:2],
+        *Walking().cautious().densities[:2],
+        TrackFilter(*nodes).clock_sigma_s,
+    )
+
+
+@pytest.mark.parametrize("name", GRADES)
+def test_a_track_is_told_them_and_they_are_taken_back(name):
+    nodes = [record.node for record in make(1, Setting(seconds=1.0)).records]
+    before, grade = of_track(nodes), GRADES[name]
+    walks = WALKED * grade.gyro_walk_radps, WALKED * grade.accel_walk_mps2
+    with told_units(grade):
+        assert of_track(nodes) == pytest.approx((grade.lever_sigma_m, *walks, *walks, KNOWN_S), rel=0.01)
+    assert of_track(nodes) == before
 
 
 def test_the_walk_told_is_that_of_the_simulators_biases():

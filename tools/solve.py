@@ -60,7 +60,7 @@ class _ClocksApartError(Exception):
 
 
 @dataclass(frozen=True, eq=False)
-class _Job:
+class _StoredDive:
     """A dive and how to solve it. lone: nodes of lamps alone, or of a camera alone: in the network, and in no pair."""
 
     args: argparse.Namespace
@@ -73,7 +73,7 @@ class _Job:
     curves: dict[str, ClockCurve]
     attitudes: list[Envelope]
 
-    def solve(self) -> _Run:
+    def solve(self) -> _DiveSolved:
         """Solve the dive and write the output; once more where its track finds the clocks apart."""
         try:
             return self._solve({})
@@ -82,7 +82,7 @@ class _Job:
         log.info("clocks: the track has found them apart; solving again, with poses that count it")
         return self._solve(apart_s)
 
-    def _solve(self, apart_s: dict[PairId, float]) -> _Run:
+    def _solve(self, apart_s: dict[PairId, float]) -> _DiveSolved:
         """Solve the dive and write the output.
 
         apart_s: how far pairs' clocks are apart, empty where that is not known yet. Raises _ClocksApartError, and
@@ -129,7 +129,7 @@ class _Job:
                 status = pair.report(dive.end_ns, dive.end_ns, problems, bad, sorted(core.unused), over=True)
                 writer.write_message(_of_dive(status, pair), dive.end_ns)
         problems_of = {pair: self._track_problems(one, apart_s) for pair, one in core.pairs.items()}
-        return _Run(core, tracks, problems_of, bad)
+        return _DiveSolved(core, tracks, problems_of, bad)
 
     def _metadata(self, apart_s: dict[PairId, float]) -> dict[str, str]:
         args, metadata = self.args, self.dive.metadata()
@@ -151,7 +151,7 @@ class _Job:
 
 
 @dataclass(frozen=True, eq=False)
-class _Run:
+class _DiveSolved:
     """What solving a dive has given. bad: how many messages were refused."""
 
     core: SolverCore
@@ -175,8 +175,8 @@ def run(args: argparse.Namespace) -> int:
             raise ConfigError("--clock-offset and --clocks are of one pair; choose it with --nodes A B")
         lone = [node for node, info in infos.items() if not _is_full(info) and (node in nodes or not args.nodes)]
         curves = chosen_curves(dive, nodes, args.clock_offset, args.clocks)
-        job = _Job(args, dive, settings, nodes, lone, infos, replaced, curves, _attitudes(dive, args, nodes))
-        done = job.solve()
+        stored = _StoredDive(args, dive, settings, nodes, lone, infos, replaced, curves, _attitudes(dive, args, nodes))
+        done = stored.solve()
     core = done.core
     _summarize(args, core, done.tracks, done.problems_of, done.bad, time.monotonic() - began_s)
     if not core.counts.total():
