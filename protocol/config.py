@@ -20,8 +20,6 @@ C = TypeVar("C", bound=msgspec.Struct)
 LONG: Final = 100_000
 # What a dive log begins with.
 MCAP: Final = b"\x89MCAP"
-
-
 # In front of all keys on the bus; Zenoh gives other characters a meaning of their own.
 Namespace: TypeAlias = Annotated[str, msgspec.Meta(pattern=r"^([A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*)?\Z")]
 
@@ -38,7 +36,6 @@ def load_config(path: Path | str, schema: type[C]) -> C:
     """Read a TOML file as schema; raise ConfigError naming file, field and value."""
     path = Path(path)
     try:
-        # Editors of Windows may put a byte order mark before the text.
         content = path.read_bytes()
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
@@ -51,6 +48,7 @@ def text_of(content: bytes, path: Path | str, wanted: str) -> str:
     if content.startswith(MCAP):
         raise ConfigError(f"{path}: is a dive log; name {wanted} here")
     try:
+        # Editors of Windows may put a byte order mark before the text.
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1

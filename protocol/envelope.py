@@ -157,7 +157,7 @@ class Refusals:
 
 
 def _shown(text: str) -> str:
-    """Return a stranger's text as a terminal may show it: no control characters, and of a long one the begin."""
+    """Return a stranger's text as a terminal may show it: without control characters, and cut where it is long."""
     short = text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."
     return "".join(letter if letter.isprintable() else "?" for letter in short)
 

@@ -55,8 +55,8 @@ class SolverCore:
 
     chosen: the pairs to solve; None for every pair of nodes that appear, A before B in the alphabet. clocks: each
     node's clock minus the common clock, where known; the node's stamps are moved to the common clock. align: estimate
-    the clock offset of each pair. apart_s: of pairs, B's clock minus A's as the whole dive has told it, for the whole
-    dive's track; stamps and triggers stay, and the poses count it. track: the tracks to make; None for no track, and no
+    the clock offset of each pair. apart_s: B's clock minus A's of pairs, s, where an earlier pass over the whole dive
+    has found it: poses count it, and stamps and triggers stay. track: the tracks to make; None for no track, and no
     network. lone: nodes of the network beside those of the chosen pairs. network: follows all nodes in one frame; None
     without `track`. unused: number of messages of each node that is not used. pace: what is left out where it cannot
     keep up. shared: other cores have some of the pairs, and perhaps the network: this one begins with none, and gets

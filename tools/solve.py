@@ -72,6 +72,7 @@ class _StoredDive:
     replaced: dict[str, NodeInfo]
     curves: dict[str, ClockCurve]
     attitudes: list[Envelope]
+    metadata: dict[str, str]
 
     def solve(self) -> _DiveSolved:
         """Solve the dive and write the output; once more where its track finds the clocks apart."""
@@ -98,7 +99,7 @@ class _StoredDive:
             lone=self.lone,
         )
         tracks = defaultdict[tuple[str, ...], Tracked](Tracked)
-        with new_dive_log(args.output, self._metadata(apart_s)) as writer:
+        with new_dive_log(args.output, self.metadata | {APART: apart_text(apart_s)}) as writer:
             for info in self.replaced.values():
                 core.handle(info)
                 writer.write_message(info, dive.start_ns)
@@ -130,15 +131,6 @@ class _StoredDive:
                 writer.write_message(_of_dive(status, pair), dive.end_ns)
         problems_of = {pair: self._track_problems(one, apart_s) for pair, one in core.pairs.items()}
         return _DiveSolved(core, tracks, problems_of, bad)
-
-    def _metadata(self, apart_s: dict[PairId, float]) -> dict[str, str]:
-        args, metadata = self.args, self.dive.metadata()
-        metadata |= {"command": "solve", "method": args.method, "checks": args.checks}
-        told = check_logs(self.dive.readers, args.authority)
-        metadata |= {AUTHENTICITY: "; ".join(told)} if told else {}
-        # A solved dive that is solved again may name the clocks of before.
-        metadata |= {CURVES: curves_text(self.curves)} if self.curves or CURVES in metadata else {}
-        return metadata | ({APART: apart_text(apart_s)} if apart_s or APART in metadata else {})
 
     def _track_problems(self, pair: PairCore, apart_s: Mapping[PairId, float]) -> list[str]:
         """Return the problems that a pair's track has told, and found in the dive."""
@@ -175,8 +167,8 @@ def run(args: argparse.Namespace) -> int:
             raise ConfigError("--clock-offset and --clocks are of one pair; choose it with --nodes A B")
         lone = [node for node, info in infos.items() if not _is_full(info) and (node in nodes or not args.nodes)]
         curves = chosen_curves(dive, nodes, args.clock_offset, args.clocks)
-        stored = _StoredDive(args, dive, settings, nodes, lone, infos, replaced, curves, _attitudes(dive, args, nodes))
-        done = stored.solve()
+        attitudes, metadata = _attitudes(dive, args, nodes), _metadata(dive, args, curves)
+        done = _StoredDive(args, dive, settings, nodes, lone, infos, replaced, curves, attitudes, metadata).solve()
     core = done.core
     _summarize(args, core, done.tracks, done.problems_of, done.bad, time.monotonic() - began_s)
     if not core.counts.total():
@@ -187,6 +179,15 @@ def run(args: argparse.Namespace) -> int:
         why = ": are the logs of the same dive?" if one_rate else ""
         log.error("nodes %s have no trigger in common%s", " and ".join(nodes), why)
     return 0 if core.matched else 1
+
+
+def _metadata(dive: Dive, args: argparse.Namespace, curves: Mapping[str, ClockCurve]) -> dict[str, str]:
+    """Return the output's metadata, but for what is found of the clocks."""
+    metadata = dive.metadata() | {"command": "solve", "method": args.method, "checks": args.checks}
+    told = check_logs(dive.readers, args.authority)
+    metadata |= {AUTHENTICITY: "; ".join(told)} if told else {}
+    # A solved dive that is solved again may name the curves of before.
+    return metadata | ({CURVES: curves_text(curves)} if curves or CURVES in metadata else {})
 
 
 def clocks_apart(core: SolverCore) -> dict[PairId, float]:

@@ -250,11 +250,9 @@ class NetEstimate(NetBelief):
     ) -> None:
         """Update by the lights chosen, each by bar, candidate, light and variance; which (B, WIDTH): as `columns`.
 
-        more_px2 (B,): what the clocks add to the variances.
-
-        compared: gives y and H about another state, None where they are linear enough. After seconds without light one
-        linear step from the prediction ends far from the lights, with the sigma of a sound one. These steps
-        (Gauss-Newton, the iterated update) end where the lights say.
+        more_px2 (B,): what the clocks add to the variances. compared: gives y and H about another state, None where
+        they are linear enough. After seconds without light one linear step from the prediction ends far from the
+        lights, with the sigma of a sound one. These steps (Gauss-Newton, the iterated update) end where the lights say.
         """
         assert self.state is not None
         n, k, light, variances = (np.array(each) for each in zip(*chosen, strict=True))
@@ -380,8 +378,11 @@ class NetEstimate(NetBelief):
         return gap, float(gap @ np.linalg.solve(S, gap))
 
     def _beside_fix(self, fix: PairFix, index: int, square_s2: float) -> Floats:
-        """Give what a pose's covariance leaves out. index: its one member. square_s2: mean square of how far the other
-        node's clock is off what is believed."""
+        """Give what a pose's covariance (6, 6) leaves out.
+
+        index: the member that is its first node. square_s2: the mean square of how far the other node's clock is off
+        what is believed, s^2.
+        """
         off_s, sigma_s = self.clock(index)
         apart_s = 1e-9 * (self.intake.ahead_ns(fix.other) - self.intake.ahead_ns(fix.node))
         squares_s2 = apart_s**2 + off_s**2 + sigma_s**2 + square_s2

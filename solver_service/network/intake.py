@@ -1,7 +1,8 @@
-"""What comes into a network, on one clock: the nodes' own ones differ, and what they tell is moved by as much.
+"""What comes into a network, on one clock: nodes' clocks differ, and what a node tells is moved by its offset.
 
-The state holds each clock's offset. But dynamics in a frame that moves with a node, and a light that is carried on from
-clock to clock, are right to a few hundredths of a second only. So the state holds what little is left.
+The state holds an offset of each clock. But two things are right for a few hundredths of a second only: the dynamics in
+a frame that moves with a node, and a light that is carried from clock to clock. So a larger offset is taken off the
+times of what a node tells, and the state holds what is left.
 """
 
 from __future__ import annotations
